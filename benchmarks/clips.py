@@ -32,6 +32,7 @@ from hesim_render.benchmark.spans import spans_of
 from hesim_render.benchmark.worker import order_of
 from hesim_render.capture import simulate as simulate_module
 from hesim_render.capture.loop import Capture
+from hesim_render.core.guard import WholeFile
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sources.render.audit.audit import Audit
 from hesim_render.specs.benchmark import BenchmarkSpec
@@ -46,7 +47,7 @@ STEPS = (
     (RecordingWriter, "finish", "manifest, preview"),
     (clip_module, "write_sharp", "sharp images"),
     (clip_module, "figures", "figures"),
-    (clip_module, "file_hash", "hashes"),
+    (WholeFile, "sha256", "hashes"),
 )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import time
 from collections.abc import Callable
@@ -15,12 +14,12 @@ from hesim_render.benchmark.card import CROISSANT_FILE, croissant, write_card
 from hesim_render.benchmark.clip import CLIP_FILE, Clip, clip_folder, is_complete
 from hesim_render.benchmark.folder import CARD_FILE, MANIFEST_FILE, PLAN_FILE, SCHEMA, Benchmark, read_clip
 from hesim_render.benchmark.forecast import BuildEstimate, estimate_build
-from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.local import LocalWorkers
 from hesim_render.benchmark.plan import BenchmarkPlan, shared_parts
 from hesim_render.benchmark.spans import SPAN_S, Span, discard_spans, spans_of
 from hesim_render.benchmark.worker import attempt, order_of
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
+from hesim_render.core.guard import WholeFile
 from hesim_render.core.output import check_target, output_errors, replacing
 from hesim_render.core.progress import Progress, in_words
 from hesim_render.specs.benchmark import BenchmarkSpec, read_benchmark
@@ -142,7 +141,7 @@ def _client(scheduler: str | None) -> Any:
 
 def last_run(root: Path) -> str:
     """What the last build in a folder took, in words."""
-    run = json.loads((root / REPORT_FILE).read_text(encoding="utf-8"))[-1]
+    run = WholeFile(root / REPORT_FILE).json()[-1]
     if not run["clips"]:
         return "all clips were there"
     text = f"{run['clips']} clips in {in_words(run['seconds'])}, {3600 * run['clips'] / run['seconds']:.0f} clips/h"
@@ -189,7 +188,7 @@ def _plan_content(plan: BenchmarkPlan) -> dict[str, Any]:
         "spec": spec.model_dump(mode="json"),
         "sensors": {str(number): content_hash(plan.sensor(clip).spec) for number, clip in sorted(first.items())},
         "scenes": {str(number): content_hash(plan.given_scene(clip).spec) for number, clip in sorted(given.items())},
-        "parts": sorted(file_hash(path) for path in pools),
+        "parts": sorted(WholeFile(path).sha256() for path in pools),
         "hesim_render": __version__,
     }
 
@@ -224,7 +223,7 @@ def _checked(plan: BenchmarkPlan, out: Path) -> Path:
     file = root / PLAN_FILE
     if file.is_file():
         try:
-            before = json.loads(file.read_text(encoding="utf-8"))
+            before = WholeFile(file).json()
         except (OSError, ValueError):
             raise OutputError(f"{file}: is damaged, so it is not known what the clips beside it are") from None
         if before != content:
@@ -249,7 +248,7 @@ def _report(
     runs = []
     if file.is_file():
         try:
-            runs = list(json.loads(file.read_text(encoding="utf-8")))
+            runs = list(WholeFile(file).json())
         except (OSError, ValueError):
             runs = []
     runs.append({
@@ -280,7 +279,7 @@ def _finish(plan: BenchmarkPlan, root: Path) -> None:
         "schema_version": SCHEMA,
         "name": plan.spec.name,
         "spec": plan.spec.model_dump(mode="json"),
-        "plan_sha256": hashlib.sha256((root / PLAN_FILE).read_bytes()).hexdigest(),
+        "plan_sha256": WholeFile(root / PLAN_FILE).sha256(),
         "versions": contents[0]["versions"],
         "units": contents[0]["units"],
         "clips": [
@@ -289,7 +288,7 @@ def _finish(plan: BenchmarkPlan, root: Path) -> None:
                 "sensor": content["sensor"], "noise": content["noise"], "seed": content["seed"],
                 "exposure_us": content["exposure_us"], "counts": content["counts"], "figures": content["figures"],
                 "verdict": content["render"].get("audit", {}).get("verdict"),
-                "sha256": file_hash(clip_folder(root, clip) / CLIP_FILE),
+                "sha256": WholeFile(clip_folder(root, clip) / CLIP_FILE).sha256(),
             }
             for clip, content in zip(plan.clips, contents, strict=True)
         ],

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.plan import BenchmarkPlan, Clip
 from hesim_render.benchmark.sharp import (
     COLOURS_FILE,
@@ -33,7 +32,7 @@ from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.capture.simulate import simulate
-from hesim_render.core.guard import read_text, reading
+from hesim_render.core.guard import WholeFile, reading
 from hesim_render.core.journal import Journal
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.recording.manifest import software_versions
@@ -100,7 +99,7 @@ def build_clip(plan: BenchmarkPlan, clip: Clip, root: Path) -> Built:
     folder = clip_folder(root, clip)
     if is_complete(root, clip):
         with reading(folder / CLIP_FILE, "as JSON"):
-            content = json.loads(read_text(folder / CLIP_FILE))
+            content = WholeFile(folder / CLIP_FILE).json()
             return Built(clip.name, 0.0, sum(entry["bytes"] for entry in content["files"].values()))
     begin = time.monotonic()
     # another worker may finish the same clip first
@@ -215,7 +214,7 @@ def _fill(plan: BenchmarkPlan, clip: Clip, folder: Path, target: Path) -> dict[s
         "versions": manifest["software"],
         "units": UNITS,
         "files": {
-            path.relative_to(folder).as_posix(): {"sha256": file_hash(path), "bytes": path.stat().st_size}
+            path.relative_to(folder).as_posix(): {"sha256": WholeFile(path).sha256(), "bytes": path.stat().st_size}
             for path in sorted(folder.rglob("*"))
             if path.is_file()
         },

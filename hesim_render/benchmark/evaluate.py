@@ -11,12 +11,12 @@ import numpy as np
 
 from hesim_render.benchmark.clip import CLIP_FILE
 from hesim_render.benchmark.folder import Benchmark, BenchmarkClip
-from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.predictions import Predictions
 from hesim_render.benchmark.tasks import TASKS, ClipTasks, Score
 from hesim_render.benchmark.verdict import verdicts
 from hesim_render.benchmark.verify import digest_of
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
+from hesim_render.core.guard import WholeFile
 from hesim_render.core.output import check_place, replacing
 from hesim_render.core.plain import finite
 from hesim_render.core.progress import Progress
@@ -73,7 +73,10 @@ def evaluate_benchmark(
         raise RangeError("split", split, "a split that has clips")
     hashes = {entry["name"]: entry["sha256"] for entry in benchmark.manifest["clips"]}
     for clip in clips:
-        if not (clip.folder / CLIP_FILE).is_file() or file_hash(clip.folder / CLIP_FILE) != hashes[clip.folder.name]:
+        if (
+            not (clip.folder / CLIP_FILE).is_file()
+            or WholeFile(clip.folder / CLIP_FILE).sha256() != hashes[clip.folder.name]
+        ):
             raise SpecError("was changed or removed after the build (benchmark verify)", file=clip.folder / CLIP_FILE)
     given = None if predictions is None else Predictions(predictions, TASKS, {clip.folder.name for clip in clips})
     longer = _longer_exposures(clips) if "hdr" in (tasks or TASKS) else {}

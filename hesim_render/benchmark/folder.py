@@ -15,7 +15,7 @@ from hesim_render.benchmark.clip import CLIP_FILE, RECORDING, SCENE
 from hesim_render.benchmark.generator import SCENE_FILE
 from hesim_render.benchmark.sharp import COLOURS_FILE, SHARP_FILE, ColourTruth, SharpImages
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import inside, read_text, reading
+from hesim_render.core.guard import WholeFile, inside, reading
 from hesim_render.core.names import FileName, PathBelow
 from hesim_render.recording.recording import Recording
 from hesim_render.specs.benchmark import Split
@@ -100,7 +100,7 @@ def read_json(path: Path, model: type[BaseModel]) -> dict[str, Any]:
     """
     if not path.is_file():
         raise SpecError("no such file", file=path)
-    content = parsed_json(read_text(path), model, path)
+    content = parsed_json(WholeFile(path).text(), model, path)
     if content["schema_version"] != SCHEMA:
         raise SpecError(f"schema_version {content['schema_version']}; this version reads {SCHEMA}", file=path)
     return content

@@ -20,7 +20,7 @@ from hesim_render.benchmark.materials import Palette, patch_names, write_picture
 from hesim_render.benchmark.meshes import mesh
 from hesim_render.benchmark.motions import CAMERA_Z, tracks
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import read_text
+from hesim_render.core.guard import WholeFile
 from hesim_render.specs.benchmark import SPLITS, BenchmarkSpec
 from hesim_render.spectral.spectrum import illuminant
 
@@ -29,15 +29,6 @@ _MESHES, _PICTURES = (".obj",), (".png", ".jpg", ".jpeg")
 _FOV_DEG = float(np.degrees(2 * np.arctan(0.5 / CAMERA_Z)))
 _WALL_Z, _WALL = -0.6, 6.0
 _MAX_DEPTH = 3
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file's bytes."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -134,7 +125,7 @@ class Generator:
         if folder.is_dir():
             for path in sorted(folder.rglob("*")):
                 if path.suffix.lower() in _MESHES + _PICTURES and path.is_file():
-                    result.setdefault(file_hash(path), path)
+                    result.setdefault(WholeFile(path).sha256(), path)
         if not result:
             raise SpecError(f"no mesh (OBJ) or picture (PNG, JPEG) in {folder}", key="scenes.parts")
         pools: dict[str, list[Path]] = {split: [] for split in SPLITS}
@@ -179,7 +170,7 @@ class Generator:
         emitters, waveforms = lamps(draws(seed, LIGHTS, scene, light), spec.lights)
         files = {name: _digest("mesh", text) for name, text in texts.items()}
         files |= {
-            name: f"file:{file_hash(p)}" if isinstance(p, Path) else _digest("texture", p.tobytes().hex())
+            name: f"file:{WholeFile(p).sha256()}" if isinstance(p, Path) else _digest("texture", p.tobytes().hex())
             for name, p in palette.files.items()
         }
         bodies = _by_content(bodies, files)
@@ -235,7 +226,7 @@ class Generator:
 
 def _into_cube(file: Path) -> np.ndarray:
     """The map of an OBJ file's own coordinates into the cube of side 1 about the origin."""
-    lines = [line.split()[1:4] for line in read_text(file).splitlines() if line.startswith("v ")]
+    lines = [line.split()[1:4] for line in WholeFile(file).text().splitlines() if line.startswith("v ")]
     try:
         points = np.array(lines, dtype=np.float64).reshape(-1, 3)
     except ValueError:

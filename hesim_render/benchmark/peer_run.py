@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import HesimError
-from hesim_render.core.guard import MOST_BYTES, printable, reading
+from hesim_render.core.guard import printable
+from hesim_render.core.npz import read_array
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.specs.peers import Peer
 
@@ -132,10 +133,7 @@ def read_events(path: Path, shape: tuple[int, int], duration_us: float) -> NDArr
     """
     if not path.is_file():
         raise PeerError("wrote no events file")
-    if path.stat().st_size > MOST_BYTES:
-        raise PeerError(f"wrote {path.stat().st_size / 1e9:.1f} GB of events; {MOST_BYTES / 1e9:.1f} GB can be read")
-    with reading(path, "as events"):
-        table = np.load(path, allow_pickle=False)
+    table = read_array(path)
     if table.ndim != 2 or table.shape[1] != 4 or table.dtype.kind not in "iuf":
         raise PeerError(f"wrote {table.dtype} {list(table.shape)}; expected numbers [event, 4]")
     rows, cols = shape

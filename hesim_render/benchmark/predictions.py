@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError, did_you_mean
-from hesim_render.core.guard import MOST_BYTES, inside, reading
+from hesim_render.core.guard import WholeFile, inside, reading
+from hesim_render.core.npz import read_array
 
 #: Formats of grey and of RGB pictures, as FFmpeg decodes PNG, and those to which they are unpacked here.
 _PNG = {"gray": "gray", "gray16be": "gray16le", "rgb24": "rgb24", "rgb48be": "rgb48le"}
@@ -71,13 +72,7 @@ class Predictions:
         path = inside(self._root, names[0])
         if len(names) > 1:
             raise SpecError("has a .png beside it; leave one of the two out", file=path)
-        if path.stat().st_size > MOST_BYTES:
-            raise SpecError("is too large", file=path)
-        if path.suffix == ".png":
-            values = _picture(path, shape, full_scale_dn)
-        else:
-            with reading(path, "as an array"):
-                values = np.load(path, allow_pickle=False)
+        values = _picture(path, shape, full_scale_dn) if path.suffix == ".png" else read_array(path)
         if values.dtype.kind not in "biuf" or values.shape != shape:
             expected = f"numbers {list(shape)}"
             raise SpecError(f"holds {values.dtype} {list(values.shape)}; expected {expected}", file=path)
@@ -96,6 +91,7 @@ def _picture(path: Path, shape: tuple[int, ...], full_scale_dn: int | None) -> N
 
     if full_scale_dn is None:
         raise SpecError("a picture has no unit in this task; give an .npy file", file=path)
+    WholeFile(path).checked()
     with reading(path, "as a PNG picture"), av.open(str(path), format="png_pipe") as container:
         stream = container.streams.video[0]
         given = f"a PNG of {stream.height} rows, {stream.width} columns, format {stream.pix_fmt}"

@@ -21,10 +21,10 @@ from pydantic import BaseModel
 
 from hesim_render.benchmark.card import card_header
 from hesim_render.benchmark.folder import CARD_FILE, Benchmark, BenchmarkClip, parsed_json
-from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.store import Put, store_of
 from hesim_render.benchmark.verify import digest_of
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
+from hesim_render.core.guard import WholeFile
 from hesim_render.core.hdf5 import COMPRESSION
 from hesim_render.core.names import FileName
 from hesim_render.core.progress import Progress
@@ -252,7 +252,8 @@ def _write_split(
             shard.close()
         put(name, path)
         result.append({
-            "name": name, "split": split, "samples": count, "bytes": path.stat().st_size, "sha256": file_hash(path),
+            "name": name, "split": split, "samples": count, "bytes": path.stat().st_size,
+            "sha256": WholeFile(path).sha256(),
         })  # fmt: skip
         path.unlink()
     return result

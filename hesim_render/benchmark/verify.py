@@ -9,9 +9,9 @@ from pathlib import Path
 
 from hesim_render.benchmark.clip import CLIP_FILE
 from hesim_render.benchmark.folder import MANIFEST_FILE, PLAN_FILE, Benchmark, read_clip
-from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.plan import shared_parts
 from hesim_render.core.errors import HesimError
+from hesim_render.core.guard import WholeFile
 from hesim_render.core.output import output_errors
 from hesim_render.core.progress import Progress
 
@@ -45,7 +45,7 @@ def verify_benchmark(root: str | Path, progress: Progress | None = None) -> list
         if not file.is_file():
             problems.append(f"{entry['name']}: is missing")
             continue
-        if file_hash(file) != entry["sha256"]:
+        if WholeFile(file).sha256() != entry["sha256"]:
             problems.append(f"{entry['name']}/{CLIP_FILE}: was changed")
             continue
         try:
@@ -56,7 +56,7 @@ def verify_benchmark(root: str | Path, progress: Progress | None = None) -> list
         parts[content["name"]] = (content["split"], set(content["parts"]))
         problems += [f"{entry['name']}/{line}" for line in _files(clip.folder, content["files"])]
     plan, expected = benchmark.root / PLAN_FILE, benchmark.manifest.get("plan_sha256")
-    if not plan.is_file() or file_hash(plan) != expected:
+    if not plan.is_file() or WholeFile(plan).sha256() != expected:
         problems.append(f"{PLAN_FILE}: was changed, or is missing")
     known, folder = {entry["name"] for entry in entries}, benchmark.root / "clips"
     listed = folder.iterdir() if folder.is_dir() else ()
@@ -100,7 +100,7 @@ def _files(folder: Path, files: dict[str, dict[str, object]]) -> list[str]:
         path = folder / name
         if not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
             problems.append(f"{name}: is missing")
-        elif path.stat().st_size != entry["bytes"] or file_hash(path) != entry["sha256"]:
+        elif path.stat().st_size != entry["bytes"] or WholeFile(path).sha256() != entry["sha256"]:
             problems.append(f"{name}: was changed")
     present = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
     return problems + [f"{name}: is not in the manifest" for name in sorted(present - set(files) - {CLIP_FILE})]

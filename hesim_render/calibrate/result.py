@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibration.file import file_digest, read_calibration, read_maps
+from hesim_render.calibration.file import read_calibration, read_maps
 from hesim_render.calibration.spec import SCHEMA_VERSION
 from hesim_render.core.errors import OutputError, SpecError
-from hesim_render.core.guard import read_text
+from hesim_render.core.guard import WholeFile
 from hesim_render.core.npz import NpzWriter
 from hesim_render.core.output import alone_in, check_place, output_errors, replacing
 from hesim_render.core.yaml_file import write_yaml
@@ -63,7 +63,7 @@ def _write_section(
         with replacing(target) as temporary, NpzWriter(temporary) as archive:
             for name, array in maps.items():
                 archive.add(name, np.asarray(array))
-        about = {"file": target.name, "sha256": file_digest(target), **{name: name for name in names}}
+        about = {"file": target.name, "sha256": WholeFile(target).sha256(), **{name: name for name in names}}
         data[section] = {**content, "maps": about}
         with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
             write_yaml(plain(data), stream)
@@ -111,7 +111,9 @@ def _remove_unnamed(path: Path, section: str) -> None:
     """Remove map files of a section that no calibration in the folder names, those of killed runs among them."""
     ours = re.compile(rf"{re.escape(path.stem)}_{section}_maps(-[0-9a-f]{{12}})?\.npz")
     result = [other for other in path.parent.iterdir() if ours.fullmatch(other.name)]
-    texts = [read_text(other) for other in {path, *path.parent.glob("*.y*ml")} if other.is_file()] if result else []
+    texts = (
+        [WholeFile(other).text() for other in {path, *path.parent.glob("*.y*ml")} if other.is_file()] if result else []
+    )
     for other in result:
         if not any(other.name in text for text in texts):
             other.unlink(missing_ok=True)

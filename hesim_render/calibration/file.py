@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from pydantic import ValidationError
 
 from hesim_render.calibration.spec import CalibrationSpec, MapsFile
 from hesim_render.core.errors import HesimError, SpecError
-from hesim_render.core.guard import inside, reading, reason
+from hesim_render.core.guard import WholeFile, inside, reason
 from hesim_render.core.npz import read_arrays
 from hesim_render.core.yaml_file import read_yaml
 from hesim_render.specs.problems import spec_error
@@ -74,12 +73,6 @@ def _map_file(file: Path, name: str, section: str) -> Path:
     return inside(file.parent, name, file=file, key=f"{section}.maps.file")
 
 
-def file_digest(file: Path) -> str:
-    """SHA-256 of a file."""
-    with reading(file), file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
 def read_maps(
     file: str | Path, section: str, data: Mapping[str, Any] | None = None, names: Iterable[str] | None = None
 ) -> dict[str, NDArray]:
@@ -113,7 +106,7 @@ def maps_and_digest(
 ) -> tuple[dict[str, NDArray], str]:
     """Maps of a section, and the SHA-256 of their file, which must be the stated one."""
     maps = _map_file(file, about.file, section)
-    digest = file_digest(maps)
+    digest = WholeFile(maps).sha256()
     if about.sha256 not in (None, digest):
         raise SpecError(f"is not the one that {file.name} was written with; run 'calibrate {section}' again", file=maps)
     return read_arrays(maps, only=names, kinds="bifu"), digest

@@ -9,10 +9,11 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from hesim_render.calibration.file import file_digest, load_calibration, maps_and_digest
+from hesim_render.calibration.file import load_calibration, maps_and_digest
 from hesim_render.calibration.rates import COUNTED, RATES, needs_interval
 from hesim_render.calibration.spec import AsynchronousSection, CalibrationSpec, EventSection, FrameSection
 from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import WholeFile
 from hesim_render.core.units import S_PER_US
 from hesim_render.specs.geometry import Region
 from hesim_render.specs.noise_file import NoiseFile
@@ -75,7 +76,7 @@ def measured_maps(noise: NoiseFile, data: CalibrationSpec | None = None) -> Meas
         If they cannot be read, are not those of `noise.sha256`, or hold values per interval that nobody stated.
     """
     data = read_named(noise) if data is None else data
-    digest = hashlib.sha256(bytes.fromhex(file_digest(noise.path)))
+    digest = hashlib.sha256(bytes.fromhex(WholeFile(noise.path).sha256()))
     sections: dict[str, dict[str, NDArray]] = {}
     intervals_s: dict[str, float | None] = {}
     for name, section in data.sections.items():

@@ -17,6 +17,7 @@ from hesim_render.capture.simulate import simulate
 from hesim_render.capture.simulate_cube import simulate_cube
 from hesim_render.capture.simulate_video import simulate_video
 from hesim_render.core.errors import HesimError, OutputError, SpecError
+from hesim_render.core.guard import WholeFile
 from hesim_render.core.journal import journal_of
 from hesim_render.core.output import check_target, output_errors, replacing
 from hesim_render.core.progress import Progress, expect
@@ -207,7 +208,7 @@ def _open(asked: _Run, overwrite: bool) -> None:
     if not state.is_file():
         return
     try:
-        result = json.loads(state.read_text(encoding="utf-8"))
+        result = WholeFile(state).json()
         identity, done = result["sha256"], [str(name) for name in result["done"]]
     except (OSError, ValueError, KeyError, TypeError):
         identity, done = None, []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +11,7 @@ from hesim_render.cli.console import Console, Json, Quiet, recording_facts
 from hesim_render.cli.options import HelpAll, Overwrite
 from hesim_render.cli.terminal import summary
 from hesim_render.core.errors import ConflictError
+from hesim_render.core.guard import WholeFile
 from hesim_render.core.output import free_place, output_errors, replacing
 
 
@@ -39,7 +39,7 @@ def isp(
     with console.progress(f"developing {recording}") as progress:
         folder = develop_recording(recording, out, steps, progress, overwrite, calibration)
     text = f"pictures in {folder}"
-    noise = json.loads((folder / MARKER).read_text(encoding="utf-8"))["noise"]
+    noise = WholeFile(folder / MARKER).json()["noise"]
     if noise is not None and noise["maps"] == "unknown":
         text += "\nthe maps of the sensor's calibration are not in a recording: --calibration FILE takes them out"
     console.result(text, {"pictures": folder, "noise": noise})

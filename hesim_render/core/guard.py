@@ -7,11 +7,15 @@ memory than there is.
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import os
 import stat
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from hesim_render.core.errors import HesimError, SpecError
 
@@ -129,25 +133,6 @@ def require_memory(size_bytes: int, what: str, file: str | Path, most: int | Non
         )
 
 
-def require_file_size(file: Path, most_bytes: int = MOST_BYTES) -> None:
-    """Refuse a file that is larger than what its reader takes, which reads it whole.
-
-    Parameters
-    ----------
-    file : the file.
-    most_bytes : largest size, bytes.
-
-    Raises
-    ------
-    SpecError
-        If it is larger.
-    """
-    with reading(file):
-        size = file.stat().st_size
-    if size > most_bytes:
-        raise SpecError(f"holds {size / 1e6:.0f} MB; such a file holds at most {most_bytes / 1e6:.0f}", file=file)
-
-
 def require_picture(width: int, height: int, pixel_bytes: int, file: str | Path) -> None:
     """Refuse a picture by the size that its header states.
 
@@ -167,27 +152,80 @@ def require_picture(width: int, height: int, pixel_bytes: int, file: str | Path)
     require_memory(pixel_bytes * width * height, "the picture", file)
 
 
-def read_text(file: Path, most_bytes: int = MOST_TEXT_BYTES) -> str:
-    """Read a UTF-8 text file of reasonable size.
+@dataclass(frozen=True)
+class WholeFile:
+    """A file that is read whole, so that its size has a limit.
 
     Parameters
     ----------
-    file : the file.
-    most_bytes : largest size, bytes.
-
-    Raises
-    ------
-    SpecError
-        If the file is not text, or too large.
+    path : the file.
+    most_bytes : largest size; default `MOST_BYTES`, for text `MOST_TEXT_BYTES`.
     """
-    with reading(file):
-        size = file.stat().st_size
-        if size > most_bytes:
-            raise SpecError(f"holds {size / 1e6:.0f} MB; such files are small", file=file)
-        try:
-            return file.read_text(encoding="utf-8")
-        except UnicodeDecodeError:
-            raise SpecError("is not a UTF-8 text file", file=file) from None
+
+    path: Path
+    most_bytes: int | None = None
+
+    def checked(self) -> Path:
+        """The path, for a library that opens the file itself.
+
+        Raises
+        ------
+        SpecError
+            If there is no such file, it is a pipe or a device, or it is too large.
+        """
+        self._require_size(MOST_BYTES)
+        return self.path
+
+    def read(self) -> bytes:
+        """All bytes; see `checked` for the errors."""
+        with reading(self.path):
+            return self.checked().read_bytes()
+
+    def text(self) -> str:
+        """The content as text.
+
+        Raises
+        ------
+        SpecError
+            As `checked`, and if it is not UTF-8.
+        """
+        self._require_size(MOST_TEXT_BYTES)
+        with reading(self.path):
+            try:
+                return self.path.read_text(encoding="utf-8")
+            except UnicodeDecodeError:
+                raise SpecError("is not a UTF-8 text file", file=self.path) from None
+
+    def json(self) -> Any:
+        """The content of a JSON file.
+
+        Raises
+        ------
+        SpecError
+            As `text`, and if it is not JSON.
+        """
+        text = self.text()
+        with reading(self.path, "as JSON"):
+            return json.loads(text)
+
+    def sha256(self) -> str:
+        """SHA-256 of the bytes, hexadecimal; of any size, as only a part of them is in memory at a time.
+
+        Raises
+        ------
+        SpecError
+            If there is no such file, or it is a pipe or a device.
+        """
+        with reading(self.path), self.path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+
+    def _require_size(self, usual_bytes: int) -> None:
+        most = usual_bytes if self.most_bytes is None else self.most_bytes
+        with reading(self.path):
+            size = self.path.stat().st_size
+        if size > most:
+            problem = f"holds {size / 1e6:.0f} MB; such a file holds at most {most / 1e6:.0f}"
+            raise SpecError(problem, file=self.path)
 
 
 def _machine_bytes() -> int:

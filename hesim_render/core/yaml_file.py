@@ -11,7 +11,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, NodeEvent, ScalarEvent
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import read_text, reading
+from hesim_render.core.guard import WholeFile, reading
 
 #: Largest file; as Python objects with line numbers it takes about a hundred times as much memory.
 _MOST_BYTES = 16 << 20
@@ -32,7 +32,7 @@ def read_yaml(file: Path, with_lines: bool = True) -> Any:
     SpecError
         If it is not a YAML mapping, or its aliases expand to too much.
     """
-    return parse_yaml(read_text(file, _MOST_BYTES), file, with_lines)
+    return parse_yaml(WholeFile(file, _MOST_BYTES).text(), file, with_lines)
 
 
 def parse_yaml(text: str, file: Path, with_lines: bool = True) -> Any:

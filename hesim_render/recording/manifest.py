@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 from collections.abc import Mapping
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, ValidationError
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import inside, read_text, reading
+from hesim_render.core.guard import WholeFile, inside
 from hesim_render.mosaic import description as mosaic
 from hesim_render.recording.dng import noise_profile
 from hesim_render.recording.manifest_spec import RecordingSpec
@@ -119,7 +118,7 @@ def _file_hashes(scene: BaseModel) -> dict[str, str]:
         names += item.deformation.files if item.deformation is not None else []
         names += [texture.file for _, texture in leaves_of(item.material or {}, TextureSpec)]
         names += [name for key, name in leaves_of(item.material or {}, str) if key.split(".")[-1] == "filename"]
-    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names if name is not None}
+    return {name: WholeFile(folder / name).sha256() for name in names if name is not None}
 
 
 def software_versions() -> dict[str, str]:
@@ -158,9 +157,7 @@ def read(folder: Path) -> dict[str, Any]:
     file = folder / MANIFEST_NAME
     if not file.is_file():
         raise SpecError(f"is not a recording (no {MANIFEST_NAME} in it)", file=folder)
-    text = read_text(inside(folder, MANIFEST_NAME))
-    with reading(file):
-        manifest = json.loads(text)
+    manifest = WholeFile(inside(folder, MANIFEST_NAME)).json()
     result = manifest.get("schema_version") if isinstance(manifest, dict) else None
     if result != SCHEMA_VERSION or isinstance(result, bool):
         raise SpecError(f"schema_version is {result!r}; this version reads {SCHEMA_VERSION}", file=file)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import MOST_PIXELS, leads_out, printable, read_text, reading
+from hesim_render.core.guard import MOST_PIXELS, WholeFile, leads_out, printable, reading
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.camera_raw import RAW_SUFFIXES, read_raw
 from hesim_render.specs.capture import CaptureSpec
@@ -170,7 +170,7 @@ def _listed(folder: Path) -> tuple[CaptureSpec, tuple[int, int], list[Series]]:
     shape: tuple[int, int] | None = None
     bit_depth: int | None = None
     series: list[Series] = []
-    for line, text in enumerate(read_text(file).splitlines(), 1):
+    for line, text in enumerate(WholeFile(file).text().splitlines(), 1):
         kind, _, rest = text.strip().partition(" ")
         if not kind or kind.startswith("#") or kind == "v":
             continue

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import read_text
+from hesim_render.core.guard import WholeFile
 from hesim_render.spectral.spectrum import Spectrum, colour_science
 
 _LAB = ("l", "a", "b")
@@ -34,7 +34,7 @@ def read_patches(file: Path) -> dict[str, Spectrum]:
     """
     lines = [
         (number, [cell.strip() for cell in next(csv.reader([line]))])
-        for number, line in enumerate(read_text(file).splitlines(), 1)
+        for number, line in enumerate(WholeFile(file).text().splitlines(), 1)
         if line.split("#", 1)[0].strip()
     ]
     if not lines:

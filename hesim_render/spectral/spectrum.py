@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import SpecError, did_you_mean
-from hesim_render.core.guard import read_text
+from hesim_render.core.guard import WholeFile
 from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
 
 #: Largest step of the grid on which products are integrated, nm.
@@ -287,7 +287,7 @@ def read_csv(file: Path, column: str | int | None = None) -> Spectrum:
     ----------
     column : header name or 1-based number of the value column; default the only one.
     """
-    lines = read_text(file).splitlines()
+    lines = WholeFile(file).text().splitlines()
     header: list[str] | None = None
     rows: list[list[float]] = []
     for number, line in enumerate(lines, 1):

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from hesim_render.capture.simulate import simulate
 from hesim_render.core.errors import HesimError, OutputError, SpecError, did_you_mean
+from hesim_render.core.guard import WholeFile
 from hesim_render.core.output import check_target, output_errors, replacing
 from hesim_render.core.progress import Progress, shown
 from hesim_render.core.region import parse_roi
@@ -177,7 +178,7 @@ def _rows(made: _Studies | _Recordings, run: Run, folder: Path) -> list[dict[str
         file = _file_of(folder, made, run)
         if file.is_file():
             try:
-                stored = json.loads(file.read_text(encoding="utf-8"))
+                stored = WholeFile(file).json()
                 if stored["run"] == json.loads(json.dumps(run.cells)):
                     return [dict(row) for row in stored["rows"]]
             except (ValueError, KeyError, TypeError):

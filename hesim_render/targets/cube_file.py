@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.extras import how_to_install
-from hesim_render.core.guard import MOST_TEXT_BYTES, reading, require_file_size, require_memory
+from hesim_render.core.guard import MOST_TEXT_BYTES, WholeFile, reading, require_memory
 from hesim_render.targets.matlab_cube import read_hdf5, read_matlab
 from hesim_render.targets.opened_cube import CubeFile, Rows, known_bands
 
@@ -88,8 +88,7 @@ def _envi(file: Path) -> CubeFile:
         from spectral.io import envi
     except ImportError:
         raise SpecError(f"ENVI files need the package spectral: {how_to_install('cubes')}", file=file) from None
-    require_file_size(file, MOST_TEXT_BYTES)
-    image = envi.open(str(file))
+    image = envi.open(str(WholeFile(file, MOST_TEXT_BYTES).checked()))
     header = image.metadata
     bands = None
     if "wavelength" in header:

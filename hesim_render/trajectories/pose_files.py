@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import read_text, reading
+from hesim_render.core.guard import WholeFile, reading
 from hesim_render.core.units import US_PER_S
 from hesim_render.core.yaml_file import parse_yaml
 
@@ -96,7 +96,7 @@ _PoseRows = tuple[list[int | None], list[int], NDArray[np.float64]]
 
 def _rows(file: Path, quaternion: str) -> _PoseRows:
     """Lines, times in µs and poses [n, 4, 4] of a file with one pose in a line."""
-    every = [(number, line.strip()) for number, line in enumerate(read_text(file).splitlines(), 1)]
+    every = [(number, line.strip()) for number, line in enumerate(WholeFile(file).text().splitlines(), 1)]
     is_csv = file.suffix.lower() == ".csv"
     rows = [(number, line) for number, line in every if line and not line.startswith("#")]
     euroc = next((row for row in every if row[1].lower().startswith(_EUROC[0])), None) if is_csv else None
@@ -156,7 +156,7 @@ def _opencv(file: Path, how: PoseFile, of_camera: bool) -> _PoseRows:
     """
     if how.axes != "scene" or how.quaternion != "hamilton":
         raise SpecError("axes and quaternion are not for files of OpenCV, which have no choice of them", file=file)
-    text = read_text(file)
+    text = WholeFile(file).text()
     if file.suffix.lower() == ".json":
         with reading(file, "as JSON"):
             content = json.loads(text)

@@ -14,9 +14,9 @@ from scipy.special import ndtr
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
-from hesim_render.calibration.file import file_digest
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import WholeFile
 from hesim_render.pixels.evs.stage import EvsStage
 
 ROOT = Path(__file__).parents[2]
@@ -183,7 +183,7 @@ def test_telegraph_pixels_forget_their_state_at_the_frame_rate_of_the_captures(f
     for name, value in (("amplitude_dn", 40.0), ("high_share", 0.3), ("correlation", 0.8)):
         jumps[name][4, 9] = value
     capture_sets.change(maps, telegraph_change_hz=None, **{f"telegraph_{name}": array for name, array in jumps.items()})
-    text = file.read_text().replace(section["maps"]["sha256"], file_digest(maps))
+    text = file.read_text().replace(section["maps"]["sha256"], WholeFile(maps).sha256())
     file.write_text(text)
     for changes in ({}, {"aps.frame_rate_hz": 90}):
         found = hr.load_sensor(tmp_path / "here" / "s.yaml", changes).aps.telegraph

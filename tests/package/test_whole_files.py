@@ -1,12 +1,15 @@
 """Readers ask for the size of a whole file before they take memory: videos, pictures, HDF5."""
 
+import hashlib
+import os
+
 import h5py
 import numpy as np
 import pytest
 import tifffile
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import require_file_size
+from hesim_render.core.guard import MOST_TEXT_BYTES, WholeFile
 from hesim_render.core.hdf5 import read_dataset
 from hesim_render.sources.video.file import FileVideo
 from hesim_render.sources.video.folder import FolderVideo
@@ -53,7 +56,36 @@ def test_chunks_of_hdf5_and_links_from_its_small_data_sets(tmp_path):
 
 
 def test_a_file_that_is_read_whole(tmp_path):
-    (tmp_path / "x").write_bytes(bytes(5000))
-    require_file_size(tmp_path / "x", 5000)
-    with pytest.raises(SpecError, match="such a file holds at most"):
-        require_file_size(tmp_path / "x", 4999)
+    file, content = tmp_path / "x", b'{"a": [1, 2]}' + b" " * 4987
+    file.write_bytes(content)
+    assert len(content) == 5000 and WholeFile(file, 5000).read() == content
+    assert WholeFile(file, 5000).text().encode() == content and WholeFile(file, 5000).json() == {"a": [1, 2]}
+    for read in (WholeFile.checked, WholeFile.read, WholeFile.text, WholeFile.json):
+        with pytest.raises(SpecError, match="such a file holds at most"):
+            read(WholeFile(file, 4999))
+    # a hash needs one piece of the file at a time
+    assert WholeFile(file, 4999).sha256() == hashlib.sha256(content).hexdigest()
+
+
+def test_text_has_a_smaller_limit_than_bytes(tmp_path):
+    with (tmp_path / "x").open("wb") as file:
+        file.truncate(MOST_TEXT_BYTES + 1)
+    assert WholeFile(tmp_path / "x").checked() == tmp_path / "x"
+    with pytest.raises(SpecError, match="such a file holds at most 67"):
+        WholeFile(tmp_path / "x").text()
+
+
+def test_pipes_and_what_is_no_text_or_json(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for read in (WholeFile.checked, WholeFile.read, WholeFile.text, WholeFile.json, WholeFile.sha256):
+        with pytest.raises(SpecError, match="is a pipe or a device"):
+            read(WholeFile(tmp_path / "pipe"))
+        with pytest.raises(SpecError, match=r"cannot be read .*No such file"):
+            read(WholeFile(tmp_path / "missing"))
+    (tmp_path / "x").write_bytes(b"\xff{}")
+    with pytest.raises(SpecError, match="is not a UTF-8 text file"):
+        WholeFile(tmp_path / "x").json()
+    for damaged in ("{", "[" * 100_000):
+        (tmp_path / "x").write_text(damaged)
+        with pytest.raises(SpecError, match=r"cannot be read as JSON|nested too deeply"):
+            WholeFile(tmp_path / "x").json()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.exr import require_exr_fits
-from hesim_render.core.guard import require_memory, require_plain
+from hesim_render.core.guard import WholeFile, reading, require_memory
 from hesim_render.sources.video.arrays import picture_bits, without_alpha
 from hesim_render.sources.video.colours import ColourTags
 from hesim_render.sources.video.digest import Hashed
@@ -119,8 +118,7 @@ class FolderVideo(Hashed):
 
     def _pieces(self) -> Iterator[bytes]:
         for path in self._files:
-            with path.open("rb") as file:
-                yield f"{path.name} {hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode()
+            yield f"{path.name} {WholeFile(path).sha256()}\n".encode()
 
     def describe(self) -> Mapping[str, Any]:
         return {
@@ -147,16 +145,10 @@ def _words(shape: PictureFormat) -> str:
 def _read_tiff(path: Path) -> NDArray:
     import tifffile
 
-    require_plain(path)
-    try:
-        with tifffile.TiffFile(path) as file:
-            page = file.pages[0].aspage()
-            require_memory(3 * page.nbytes, "the picture", path)
-            image = page.asarray()
-    except SpecError:
-        raise
-    except Exception as error:  # tifffile raises many kinds on files that are not what they say
-        raise SpecError(f"cannot be read ({str(error).splitlines()[0] if str(error) else error})", file=path) from None
+    with reading(path), tifffile.TiffFile(path) as file:
+        page = file.pages[0].aspage()
+        require_memory(3 * page.nbytes, "the picture", path)
+        image = page.asarray()
     if image.ndim not in (2, 3):
         raise SpecError(f"has shape {image.shape}; expected [row, col] or [row, col, channel]", file=path)
     return image
@@ -167,11 +159,8 @@ def _read_exr(path: Path) -> NDArray:
     import OpenEXR
 
     require_exr_fits(path)
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: channel.pixels for name, channel in file.parts[0].channels.items()}
-    except Exception as error:  # OpenEXR raises plain RuntimeError and others
-        raise SpecError(f"cannot be read ({str(error).splitlines()[0] if str(error) else error})", file=path) from None
+    with reading(path), OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = {name: channel.pixels for name, channel in file.parts[0].channels.items()}
     if {"R", "G", "B"} <= set(channels):
         image = np.stack([channels[name] for name in "RGB"], axis=-1)
     elif "Y" in channels:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import require_file_size, require_picture
+from hesim_render.core.guard import WholeFile, require_picture
 from hesim_render.sources.video.arrays import without_alpha
 from hesim_render.sources.video.colours import ColourTags
 from hesim_render.sources.video.picture import PictureFormat, Planes
@@ -108,7 +108,7 @@ def decode_picture(path: Path) -> tuple[PictureFormat, ColourTags, Planes]:
     """Decode a picture file. Its tags hold what the file states; the default primaries of pictures are BT.709."""
     import av
 
-    require_file_size(path)
+    WholeFile(path).checked()
     try:
         with av.open(str(path)) as container:
             require_decodable(container.streams.video[0], path)

@@ -14,7 +14,7 @@ from xml.parsers import expat
 
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import leads_out, read_text, reading
+from hesim_render.core.guard import WholeFile, leads_out, reading
 from hesim_render.sources.render.scene.sizes import require_fits
 from hesim_render.specs.scene import OUTSIDE
 
@@ -71,7 +71,7 @@ class SceneFiles:
         if not file.is_file():
             raise SpecError("no such file", file=file)
         with reading(file, "as XML"):
-            parser.Parse(read_text(file).encode(), True)
+            parser.Parse(WholeFile(file).text().encode(), True)
 
     def _element(self, tag: str, given: Mapping[str, str], file: Path) -> None:
         name = given.get("name", "")

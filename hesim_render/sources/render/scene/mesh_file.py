@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
 from hesim_render.core.extras import how_to_install
-from hesim_render.core.guard import leads_out, reading, require_file_size, require_memory, require_plain
+from hesim_render.core.guard import WholeFile, leads_out, reading, require_memory, require_plain
 from hesim_render.sources.render.scene.deformation import Deformation, read_deformation
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, make_mesh, transform
 from hesim_render.sources.render.scene.pictures import picture_texture
@@ -145,9 +145,9 @@ def _load(path: Path, kind: str, root: Path | None, key: str) -> list[Any]:
             require_plain(path.parent / name)
             return super().get(name)
 
-    require_file_size(path)
+    content = io.BytesIO(WholeFile(path).read())
     with reading(path, "as a mesh"):
-        loaded = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type=kind, resolver=Beside(str(path)))
+        loaded = trimesh.load_scene(content, file_type=kind, resolver=Beside(str(path)))
         return [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh)]
 
 

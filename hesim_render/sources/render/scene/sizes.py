@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.exr import exr_header
-from hesim_render.core.guard import reading, require_file_size, require_memory, require_picture
+from hesim_render.core.guard import WholeFile, reading, require_memory, require_picture
 
 #: A header is looked for in so many bytes.
 _HEAD = 1 << 16
@@ -36,9 +36,8 @@ def require_fits(file: Path) -> None:
     SpecError
         If it would not fit.
     """
-    require_file_size(file)
     with reading(file):
-        with file.open("rb") as stream:
+        with WholeFile(file).checked().open("rb") as stream:
             head = stream.read(_HEAD)
         if head.startswith(b"ply"):
             _ply(file, head)
