@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from hesim_render.sources.render.scene import plugins
+from hesim_render.sources.render.scene import plugin_tables
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a compiler to make the attempt")
@@ -124,6 +124,6 @@ def test_every_plugin_that_is_rendered_is_a_file_of_mitsubas_own():
     from pathlib import Path
 
     shipped = {path.stem for path in (Path(mitsuba().__file__).parent / "plugins").glob("*.so")}
-    for table in (plugins.HONOURED, plugins.EXACT, plugins.OF_THE_SENSOR_FILE):
+    for table in (plugin_tables.HONOURED, plugin_tables.EXACT, plugin_tables.OF_THE_SENSOR_FILE):
         for names in table.values():
             assert set(names) <= shipped

@@ -20,7 +20,7 @@ from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer, Windows
 from hesim_render.sources.render.change_driven.sample_instants import STEP_PX, MotionClock
 from hesim_render.sources.render.exact import RenderedFlux, used_responses
-from hesim_render.sources.render.scene import plugins
+from hesim_render.sources.render.scene import plugin_tables
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.mitsuba_scene import _plugin_dict
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
@@ -109,10 +109,10 @@ def tables():
     """Kind of each plugin that the tables name, and how it is taken."""
     found = {}
     for how, table in (
-        ("default", plugins.HONOURED),
-        ("exact", plugins.EXACT),
-        ("sensor file", plugins.OF_THE_SENSOR_FILE),
-        ("refused", plugins.REFUSED),
+        ("default", plugin_tables.HONOURED),
+        ("exact", plugin_tables.EXACT),
+        ("sensor file", plugin_tables.OF_THE_SENSOR_FILE),
+        ("refused", plugin_tables.REFUSED),
     ):
         for kind, names in table.items():
             for name in names:
@@ -254,7 +254,7 @@ def test_what_no_shape_uses_decides_nothing(tmp_path):
             build(mitsuba(), Scene.from_mitsuba(tmp_path / "s.xml").spec)
 
 
-@pytest.mark.parametrize("name", sorted(plugins.REFUSED["Integrator"]))
+@pytest.mark.parametrize("name", sorted(plugin_tables.REFUSED["Integrator"]))
 def test_integrators_that_are_not_rendered_are_refused_by_name(name, tmp_path):
     text = refusal({**ROOM, "light": {"type": name}})
     assert text.startswith(f"mitsuba.inline.light: integrator '{name}': ") and ("use '" in text or "put the" in text)
@@ -319,7 +319,7 @@ def test_a_volume_does_not_stay_behind_when_its_shape_moves():
 # ---- BSDFs, emitters, shapes --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", sorted(plugins.REFUSED["BSDF"]))
+@pytest.mark.parametrize("name", sorted(plugin_tables.REFUSED["BSDF"]))
 def test_what_needs_polarised_light_is_refused(name, tmp_path):
     text = refusal(
         {**ROOM, "ball": {**BALL, "skin": {"type": "blendbsdf", "weight": 0.5, "a": {"type": name}, "b": GREY}}}

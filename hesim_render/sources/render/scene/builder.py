@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,16 +30,13 @@ from hesim_render.sources.render.scene.mitsuba_version import (
 from hesim_render.sources.render.scene.paint import Paint
 from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.sources.render.scene.pictures import picture_texture
+from hesim_render.sources.render.scene.scene_spectra import check_coverage, target_pieces
 from hesim_render.sources.render.scene.surfaces import area_emitter, is_diffuse, paint_of, radiance_of, surface_of
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals
 from hesim_render.specs.geometry import rotation_about
-from hesim_render.specs.reflectance import leaves_of
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
-from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.specs.target import lamps_of
-from hesim_render.spectral.spectrum import Spectrum, constant, require_coverage
-from hesim_render.targets.build import placed_pieces
+from hesim_render.spectral.spectrum import Spectrum
 from hesim_render.targets.piece import Picture, TargetPiece
 
 
@@ -205,7 +202,7 @@ def _describe(
     paints: list[Paint] = []
     if spec.target is not None:
         groups["target"] = []
-        for number, piece in enumerate(_target_pieces(spec)):
+        for number, piece in enumerate(target_pieces(spec)):
             name = f"target_{number}"
             content[name] = _piece(mi, name, piece)
             groups["target"].append(name)
@@ -242,16 +239,6 @@ def _without_normals(item: ObjectSpec, spec: SceneSpec, groups: Mapping[str, lis
     path = spec.folder / str(item.mesh)
     is_read = item.shape == "mesh" and path.suffix.lower().lstrip(".") in MESH_FILES
     return groups[item.name] if is_read and not brings_normals(path) else []
-
-
-def _target_pieces(spec: SceneSpec) -> list[TargetPiece]:
-    assert spec.target is not None
-    try:
-        return placed_pieces(spec.target)
-    except SpecError as error:
-        if error.file is not None:
-            raise
-        raise SpecError(str(error), file=spec.file) from None
 
 
 def _piece(mi: MitsubaModule, name: str, piece: TargetPiece) -> MitsubaObject:
@@ -302,51 +289,3 @@ def _box_mesh() -> tuple[NDArray, NDArray, NDArray]:
             vertices.append(face)
             uv.append(flat_uv)
     return np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv)
-
-
-def named_spectra(spec: SceneSpec) -> Iterator[tuple[str, Spectrum]]:
-    """Key and spectrum of a scene file's lights and reflectances; none in darkness or for a Mitsuba scene.
-
-    The RGB colours of a Mitsuba scene become spectra over the whole visible range, so there is nothing to check.
-    """
-    lamp = lamps_of(spec.target)
-    is_lit = any(light.is_lit for light in spec.lights) or any(own.is_lit for own in spec.lamps)
-    if spec.mitsuba is not None or not is_lit:
-        return
-    for number, light in enumerate(spec.lights):
-        if light.is_lit:
-            yield f"{lights.key_of(spec.lights, number)}.illuminant", light.illuminant.load()
-    if spec.target is not None:
-        if lamp is not None and lamp.is_lit:
-            yield "target.illuminant", lamp.illuminant.load()
-        for piece in _target_pieces(spec):
-            if not isinstance(piece.reflectance, Picture):
-                yield f"target ({piece.name})", piece.reflectance
-            elif piece.reflectance.wavelength_nm is not None:
-                ends = piece.reflectance.wavelength_nm[[0, -1]].tolist()
-                yield f"target ({piece.name})", constant(1.0, *ends)
-    for item in spec.objects:
-        own = [("reflectance", item.reflectance), ("pattern", item.pattern)]
-        if item.texture is not None or item.material is not None:
-            own = [(f"material.{key}", source) for key, source in leaves_of(item.material or {}, SpectrumSpec)]
-        if item.emission is not None and item.emission.is_lit:
-            own.append(("emission.illuminant", item.emission.illuminant))
-        for key, source in own:
-            if source is not None:
-                yield f"objects.{item.name}.{key}", source.load()
-
-
-def check_coverage(spec: SceneSpec, responses: Mapping[str, Spectrum]) -> None:
-    """Refuse a scene in which a light or a reflectance covers less than 99.9 % of a response.
-
-    Raises
-    ------
-    SpecError
-        Names scene file and key.
-    """
-    for key, spectrum in named_spectra(spec):
-        for name, response in responses.items():
-            try:
-                require_coverage(spectrum, response, "this spectrum", f"filter {name!r}")
-            except SpecError as error:
-                raise SpecError(str(error), file=spec.file, key=key) from None

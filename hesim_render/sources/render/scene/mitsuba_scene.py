@@ -13,13 +13,14 @@ from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.files import require_short_number
 from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
-from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, load_scene, switch_off, transform
+from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, transform
+from hesim_render.sources.render.scene.parsed_scene import load_scene, switch_off
+from hesim_render.sources.render.scene.plugin_tables import require_known
 from hesim_render.sources.render.scene.plugins import (
     Used,
     check_camera,
     exact_reason,
     integrator_plugin,
-    require_known,
     set_depth,
     used_plugins,
 )

@@ -1,9 +1,4 @@
-"""Treatment of each plugin that a Mitsuba scene may name.
-
-A plugin is rendered as Mitsuba renders it, or leads to the exact mode with a reason, or is refused with its name, its
-place and an alternative. A few plugins belong to the sensor file, so their settings are ignored. Plugins that are not
-in these tables are never loaded, so a scene file cannot name a library to run.
-"""
+"""The plugins of a parsed Mitsuba scene: their places, and what follows from the tables of `plugin_tables`."""
 
 from __future__ import annotations
 
@@ -15,125 +10,16 @@ from typing import Any
 
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
-from hesim_render.sources.render.scene.mitsuba_version import children_of
+from hesim_render.sources.render.scene.parsed_scene import children_of
+from hesim_render.sources.render.scene.plugin_tables import (
+    EXACT,
+    HONOURED,
+    KIND_OF_CLASS,
+    KIND_OF_PLUGIN,
+    OF_THE_SENSOR_FILE,
+    REFUSED,
+)
 
-#: Plugins that both modes render as Mitsuba does, by kind.
-HONOURED: dict[str, tuple[str, ...]] = {
-    "Integrator": ("direct", "path"),
-    "Sensor": ("perspective",),
-    "Emitter": ("area", "constant", "directional", "envmap", "point", "projector", "spot", "sunsky"),
-    "Shape": (
-        *("cube", "cylinder", "disk", "obj", "ply", "rectangle", "serialized", "sphere"),
-        *("bsplinecurve", "ellipsoids", "ellipsoidsmesh", "linearcurve", "merge", "sdfgrid"),
-    ),
-    "BSDF": (
-        *("blendbsdf", "bumpmap", "conductor", "dielectric", "diffuse", "hair", "mask", "measured", "normalmap"),
-        *("null", "plastic", "pplastic", "principled", "principledthin", "roughconductor", "roughdielectric"),
-        *("roughplastic", "thindielectric", "twosided"),
-    ),
-    "Texture": (
-        *("bitmap", "blackbody", "checkerboard", "d65", "irregular", "mesh_attribute", "rawconstant", "regular"),
-        *("srgb", "uniform", "volume"),
-    ),
-    "Volume": ("constvolume", "gridvolume"),
-}
-
-#: Plugins that only the exact mode renders, and why.
-EXACT: dict[str, dict[str, str]] = {
-    "Integrator": {
-        "volpath": "it follows light through media, not only between surfaces",
-        "volpathmis": "it follows light through media, not only between surfaces",
-    },
-    "Shape": {
-        "instance": "it is a copy that has no surface of its own",
-        "shapegroup": "its copies have no surface of their own",
-    },
-    "Medium": {name: "light is followed through it" for name in ("heterogeneous", "homogeneous")},
-    "PhaseFunction": {
-        name: "it belongs to a medium" for name in ("blendphase", "hg", "isotropic", "rayleigh", "sggx", "tabphase")
-    },
-}
-
-#: Ignored, because the sensor file decides: pixels are boxes that integrate, with noise of their own.
-OF_THE_SENSOR_FILE: dict[str, tuple[str, ...]] = {
-    "Film": ("hdrfilm",),
-    "Sampler": ("independent", "ldsampler", "multijitter", "orthogonal", "stratified"),
-    "ReconstructionFilter": ("box", "catmullrom", "gaussian", "lanczos", "mitchell", "tent"),
-}
-
-_UNPOLARISED = "light is rendered without its polarisation, of which this would keep a part; remove it"
-_BESIDE = "it adds other quantities to a picture; put the integrator that is inside it in its place"
-_DERIVATIVES = "it is made for derivatives; use 'path'"
-_CAMERA = "use a 'perspective' sensor, or add a 'camera' section to the scene file"
-
-#: Plugins that are refused, and alternatives.
-REFUSED: dict[str, dict[str, str]] = {
-    "Integrator": {
-        "aov": _BESIDE,
-        "moment": _BESIDE,
-        "stokes": _BESIDE,
-        "depth": "it gives distances, not light; use 'path'",
-        "ptracer": "it throws light at a film of its own, and pixels are asked one by one here; use 'path'",
-        "prb": _DERIVATIVES,
-        "prb_basic": _DERIVATIVES,
-        "prb_projective": _DERIVATIVES,
-        "direct_projective": "it is made for derivatives; use 'direct'",
-        "prbvolpath": "it is made for derivatives; use 'volpath'",
-        "volprim_rf_basic": "it shows a radiance field that has no units; use 'path' with emitters and materials",
-    },
-    "Sensor": {
-        "thinlens": f"its depth of field is not rendered: all is in focus here; {_CAMERA}",
-        "orthographic": f"a lens sees in perspective; {_CAMERA}",
-        "irradiancemeter": f"it has no picture; {_CAMERA}",
-        "radiancemeter": f"it has no picture; {_CAMERA}",
-        "distant": f"it has no picture; {_CAMERA}",
-        "batch": f"it is several cameras at once; {_CAMERA}",
-        "flat_sensor": f"it has no picture; {_CAMERA}",
-    },
-    "Film": {"specfilm": "its channels are responses, which the sensor file gives; use 'hdrfilm'"},
-    "Emitter": {
-        "directionalarea": "no path from the camera can find its light; use 'directional', 'spot' or 'projector'",
-        "timed_sunsky": "its sun moves by a clock of its own; use 'sunsky' with the time of day that is meant",
-    },
-    "Shape": {"blender": "it is read from the memory of a running Blender; export the mesh as PLY"},
-    "BSDF": {name: _UNPOLARISED for name in ("circular", "measured_polarized", "polarizer", "retarder")},
-}
-
-#: Class names of objects that a dictionary may contain. (All objects written in Python share one.)
-_MADE: dict[str, tuple[str, str]] = {
-    "AOVIntegrator": ("Integrator", "aov"),
-    "BatchSensor": ("Sensor", "batch"),
-    "BlenderMesh": ("Shape", "blender"),
-    "CircularPolarizer": ("BSDF", "circular"),
-    "DepthIntegrator": ("Integrator", "depth"),
-    "DirectIntegrator": ("Integrator", "direct"),
-    "DirectionalArea": ("Emitter", "directionalarea"),
-    "Instance": ("Shape", "instance"),
-    "LinearPolarizer": ("BSDF", "polarizer"),
-    "LinearRetarder": ("BSDF", "retarder"),
-    "MeasuredPolarized": ("BSDF", "measured_polarized"),
-    "MomentIntegrator": ("Integrator", "moment"),
-    "ParticleTracerIntegrator": ("Integrator", "ptracer"),
-    "PathIntegrator": ("Integrator", "path"),
-    "PerspectiveCamera": ("Sensor", "perspective"),
-    "ShapeGroupPlugin": ("Shape", "shapegroup"),
-    "SpecFilm": ("Film", "specfilm"),
-    "StokesIntegrator": ("Integrator", "stokes"),
-    "ThinLensCamera": ("Sensor", "thinlens"),
-    "TimedSunskyEmitter": ("Emitter", "timed_sunsky"),
-    "VolpathMisIntegratorImpl": ("Integrator", "volpathmis"),
-    "VolumetricPathIntegrator": ("Integrator", "volpath"),
-}
-
-#: Kind of each plugin.
-_KINDS = {
-    name: kind
-    for table in (HONOURED, EXACT, OF_THE_SENSOR_FILE, REFUSED)
-    for kind, names in table.items()
-    for name in names
-}
-#: Types that a dictionary may name besides plugins.
-_BESIDE_PLUGINS = ("scene", "ref", "rgb", "spectrum")
 _THROUGH_MEDIA = ("volpath", "volpathmis")
 #: Integrators whose path length can be set.
 _HAVE_DEPTH = ("path", *_THROUGH_MEDIA)
@@ -173,18 +59,6 @@ class Used:
         return f"{self.kind if self.kind == 'BSDF' else self.kind.lower()} '{self.name}'"
 
 
-def require_known(name: Any, file: Path | None, key: str) -> None:
-    """Refuse a type in a dictionary that is not a plugin of Mitsuba. To examine an unknown type, Mitsuba would load it.
-
-    Raises
-    ------
-    SpecError
-        Names the place.
-    """
-    if not isinstance(name, str) or (name not in _KINDS and name not in _BESIDE_PLUGINS):
-        raise SpecError(f"type {name!r} is no plugin of Mitsuba's that is known here", file=file, key=key)
-
-
 def used_plugins(mi: MitsubaModule, state: Any, file: Path | None) -> list[Used]:
     """The plugins of a parsed scene, in order; `file` is the scene file, for a dictionary within it.
 
@@ -198,7 +72,7 @@ def used_plugins(mi: MitsubaModule, state: Any, file: Path | None) -> list[Used]
     nodes, types = list(state.nodes), mi.Properties.Type
     for node in nodes:
         name = node.props.plugin_name()
-        if name not in _KINDS and node.type.name != "Scene":
+        if name not in KIND_OF_PLUGIN and node.type.name != "Scene":
             unknown = Used(_kind_of(node), name, node.props.id(), _place(mi, state, node, file), node, ())
             raise unknown.refused(_unknown(unknown.kind))
     _leave_out_unused(mi, nodes)
@@ -226,7 +100,9 @@ def used_plugins(mi: MitsubaModule, state: Any, file: Path | None) -> list[Used]
 
 def _kind_of(node: Any) -> str:
     """Kind of a node. A parsed dictionary does not state that of an object written in Python."""
-    return _KINDS.get(node.props.plugin_name(), "Plugin") if node.type.name == "Unknown" else str(node.type.name)
+    return (
+        KIND_OF_PLUGIN.get(node.props.plugin_name(), "Plugin") if node.type.name == "Unknown" else str(node.type.name)
+    )
 
 
 def _leave_out_unused(mi: MitsubaModule, nodes: Sequence[Any]) -> None:
@@ -263,8 +139,8 @@ def _made(mi: MitsubaModule, value: Any, place: Mapping[str, Any], owner: Any) -
         name = item.class_name()
         kinds = (mi.Integrator, mi.Sensor, mi.Shape, mi.Medium)
         kind = next((kind.__name__ for kind in kinds if isinstance(item, kind)), "")
-        if name in _MADE:
-            kind, name = _MADE[name]
+        if name in KIND_OF_CLASS:
+            kind, name = KIND_OF_CLASS[name]
         elif kind == "Medium":
             name = name.removesuffix("Medium").lower()
         if kind:

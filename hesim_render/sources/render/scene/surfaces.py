@@ -13,7 +13,7 @@ from hesim_render.sources.render.scene.files import require_material
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, spectrum_dict, transform
 from hesim_render.sources.render.scene.paint import Paint
 from hesim_render.sources.render.scene.pictures import picture_texture
-from hesim_render.sources.render.scene.plugins import HONOURED, REFUSED
+from hesim_render.sources.render.scene.plugin_tables import HONOURED, REFUSED
 from hesim_render.sources.render.scene.sizes import require_fits
 from hesim_render.specs.reflectance import TextureSpec
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
