@@ -42,12 +42,12 @@ def simulated(lux, span_s, bins_hz, devices, seed=1):
     fitted, theta = FITTED, 0.2
     shot = theta / fitted["threshold"] * np.sqrt(0.1 + DARK_LUX)
     leak = {"process": "drift", "rate_hz": fitted["leak_hz"], "rate_hz_per_dn": fitted["leak_hz_per_lux"],
-            "spread": fitted["spread"], "tail_hz": fitted["tail_hz"]}  # fmt: skip
+            "spread_rel": fitted["spread"], "tail_hz": fitted["tail_hz"]}  # fmt: skip
     beta = {"beta1": 1.0, "beta2": DARK_LUX, "beta3": shot, "beta4": shot * np.sqrt(DARK_LUX), "beta5": 0.0}
     spec = read_sensor("reference-mono", {
         "geometry.rows": SIDE, "geometry.cols": SIDE * devices, "device_seed": seed, "evs.reference": "last_event",
         "evs.tick_us": None, "evs.window_us": 1000, "evs.contrast_threshold_on": theta,
-        "evs.contrast_threshold_off": theta * fitted["off"], "evs.threshold_mismatch_std": fitted["mismatch"],
+        "evs.contrast_threshold_off": theta * fitted["off"], "evs.threshold_mismatch_rel": fitted["mismatch"],
         "evs.signal_reference": {"k_dn_per_e": 1.0, "t_ref_us": 1000.0, "filter": "own"}, "evs.coefficients": [beta],
         "evs.shot_law": "sqrt", "evs.photoreceptor_cutoff_hz": fitted["bandwidth_hz"], "evs.leak": leak,
         "evs.refractory_period_us": DEAD_US,

@@ -41,7 +41,7 @@ DEFECTS = {
 #: A sensor with 400 comparisons a second, that of benchmarks/specs/full.yaml.
 TICKS = {
     "evs.tick_us": 2500, "evs.window_us": 2500, "evs.contrast_threshold_on": 0.3, "evs.contrast_threshold_off": 0.3,
-    "evs.threshold_mismatch_std": 0.03,
+    "evs.threshold_mismatch_rel": 0.03,
     "evs.coefficients": [{"beta1": 1.0, "beta2": 40.0, "beta3": 0.894427, "beta4": 2.0, "beta5": 0.0}],
 }  # fmt: skip
 #: Of each sensor: changes that make the known one, those that make the one of the test, and lux on white.
@@ -50,7 +50,7 @@ SENSORS = {
     "davis346": (
         {"evs.leak_rate_hz": 0.3, "evs.defects": HOT},
         {
-            "evs.leak_rate_hz": 0.3, "evs.threshold_mismatch_std": 0.2, "evs.refractory_period_us": 500,
+            "evs.leak_rate_hz": 0.3, "evs.threshold_mismatch_rel": 0.2, "evs.refractory_period_us": 500,
             "evs.photoreceptor": {"cutoff_hz": 300.0, "signal_dn": 20.0, "min_cutoff_hz": 20.0},
             "evs.defects": DEFECTS,
         },
@@ -60,7 +60,7 @@ SENSORS = {
     "reference-mono": (
         TICKS | {"evs.defects": HOT},
         TICKS | {
-            "evs.threshold_mismatch_std": 0.1, "evs.defects": DEFECTS,
+            "evs.threshold_mismatch_rel": 0.1, "evs.defects": DEFECTS,
             "evs.coefficients": [{"beta1": 1.0, "beta2": 40.0, "beta3": 0.894427, "beta4": 4.0, "beta5": 0.0}],
         },
         (50.0, 150.0, 500.0),

@@ -36,7 +36,7 @@ OVERRIDES = {
     # 3.4 standard deviations of the static difference at 50 electrons: about 4e-4 events per sample and sign
     "evs.contrast_threshold_on": 0.67,
     "evs.contrast_threshold_off": 0.67,
-    "evs.threshold_mismatch_std": 0.03,
+    "evs.threshold_mismatch_rel": 0.03,
     "evs.leak_rate_hz": 0.1,
 }
 WINDOW_ELECTRONS = 50.0

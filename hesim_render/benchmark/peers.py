@@ -215,7 +215,7 @@ def _settings(peer: Peer, sensor: Sensor, spec: PeersSpec, fps: float) -> dict[s
     return {
         "width": cols, "height": rows, "duration_us": spec.duration_us, "fps": fps, "encoding": peer.encoding,
         "bits": peer.bits, "contrast_threshold_on": evs.contrast_threshold_on,
-        "contrast_threshold_off": evs.contrast_threshold_off, "threshold_mismatch_std": evs.threshold_mismatch_std,
+        "contrast_threshold_off": evs.contrast_threshold_off, "threshold_mismatch_rel": evs.threshold_mismatch_rel,
         "leak_rate_hz": evs.leak.rate_hz if evs.leak else evs.leak_rate_hz,
         "refractory_period_us": evs.refractory_period_us or 0,
         "seed": spec.seed, "noise": peer.noise, "options": peer.options,

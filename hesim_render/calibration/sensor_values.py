@@ -142,7 +142,7 @@ def _evs_values(sensor: Mapping[str, Any], evs: EventSection, noise: NoiseFile) 
     values = {
         "contrast_threshold_on": theta * (1 - rho),
         "contrast_threshold_off": theta * (1 + rho),
-        "threshold_mismatch_std": evs.threshold_mismatch.value or 0.0,
+        "threshold_mismatch_rel": evs.threshold_mismatch_rel.value or 0.0,
         "coefficients": coefficients,
         "shot_law": evs.shot_law,
         "leak_rate_hz": _leak_rate_hz(evs, noise),
@@ -172,7 +172,7 @@ def _asynchronous_values(sensor: Mapping[str, Any], evs: AsynchronousSection, fi
     return {
         "contrast_threshold_on": _needed(evs.theta_on, "evs.theta_on", file),
         "contrast_threshold_off": _needed(evs.theta_off, "evs.theta_off", file),
-        "threshold_mismatch_std": _needed(evs.threshold_mismatch, "evs.threshold_mismatch", file),
+        "threshold_mismatch_rel": _needed(evs.threshold_mismatch_rel, "evs.threshold_mismatch_rel", file),
         "coefficients": [beta],
         "shot_law": evs.shot_law,
         "leak_rate_hz": max(0.0, _needed(evs.leak_rate_hz, "evs.leak_rate_hz", file)),

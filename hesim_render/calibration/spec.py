@@ -121,7 +121,7 @@ class FrameSection(_Section):
     full_well_e: FullWell
     dsnu_e: EstimateSpec
     prnu_percent: EstimateSpec
-    linearity_error: EstimateSpec
+    linearity_error_percent: EstimateSpec
     findings: list[FindingSpec] = []
     maps: MapsFile
     frame_rate_hz: PositiveFloat | None = Field(None, description="of the captures; older calibrations lack it")
@@ -162,7 +162,7 @@ class EventSection(EventParameters):
     theta: EstimateSpec
     theta_on: EstimateSpec
     theta_off: EstimateSpec
-    threshold_mismatch: EstimateSpec
+    threshold_mismatch_rel: EstimateSpec
     asymmetry: EstimateSpec
     leak_per_trial: EstimateSpec
     leak_rate_hz: EstimateSpec | None = Field(
@@ -211,9 +211,9 @@ class AsynchronousSection(_Section):
     theta: EstimateSpec
     theta_on: EstimateSpec
     theta_off: EstimateSpec
-    threshold_mismatch: EstimateSpec
-    threshold_mismatch_on: EstimateSpec
-    threshold_mismatch_off: EstimateSpec
+    threshold_mismatch_rel: EstimateSpec
+    threshold_mismatch_on_rel: EstimateSpec
+    threshold_mismatch_off_rel: EstimateSpec
     photoreceptor_cutoff_hz: EstimateSpec
     leak_rate_hz: EstimateSpec
     noise: list[NoiseInLight] = []

@@ -64,7 +64,7 @@ def _events(evs: EvsNoise) -> dict[str, float]:
     theta_on, theta_off = spec.contrast_threshold_on, spec.contrast_threshold_off
     result = {
         "theta_on": theta_on, "theta_off": theta_off,
-        "threshold_mismatch": 0.0 if "mismatch" in off else spec.threshold_mismatch_std,
+        "threshold_mismatch_rel": 0.0 if "mismatch" in off else spec.threshold_mismatch_rel,
     }  # fmt: skip
     if spec.leak is None:
         rate_hz = 0.0 if "leak" in off else spec.leak_rate_hz

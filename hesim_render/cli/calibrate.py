@@ -160,11 +160,11 @@ def _show(console: Console, part: str, out: Path, report: Path | None, sensor_fi
 #: Figures of a recording and of all together, as the command prints them.
 _OF_ONE = {
     "on_rate_hz": "ON events", "off_rate_hz": "OFF events", "leak_rate_hz": "leak",
-    "on_rate_spread": "spread of ON rates", "off_rate_spread": "spread of OFF rates",
+    "on_rate_spread_rel": "spread of ON rates", "off_rate_spread_rel": "spread of OFF rates",
     "on_local_variation": "local variation",
 }  # fmt: skip
 _OF_ALL = {
-    "theta_on": "θ₊", "theta_off": "θ₋", "threshold_ratio": "θ₋/θ₊", "threshold_mismatch": "threshold mismatch",
+    "theta_on": "θ₊", "theta_off": "θ₋", "threshold_ratio": "θ₋/θ₊", "threshold_mismatch_rel": "threshold mismatch",
     "leak_dark_hz": "leak in the dark", "leak_growth_hz_per_lux": "growth of the leak", "hot_share": "hot pixels",
     "silent_share": "silent pixels", "dead_time_us": "dead time", "readout_limit_events_per_s": "read-out limit",
 }  # fmt: skip

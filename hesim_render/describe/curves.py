@@ -59,7 +59,7 @@ class _Pixel:
         self.flux = electrons_per_s_lux(spec, spec.pixels[spec.tile_rows[row][col]].filter, light)
         self._table = self.noise.table.each(lambda values: values[position])
         self.thresholds = self.spec.contrast_threshold_on, self.spec.contrast_threshold_off
-        self.mismatch = 0.0 if "mismatch" in self.noise.off else self.spec.threshold_mismatch_std
+        self.mismatch = 0.0 if "mismatch" in self.noise.off else self.spec.threshold_mismatch_rel
 
     def level(self, lux: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """ln x, its variance, and the part of the noise's bandwidth that the photoreceptor leaves."""

@@ -82,7 +82,7 @@ def _events(sensor: Sensor) -> list[Row]:
     evs, grid = sensor.evs.spec, sensor.layout.evs_shape
     sheet = evs.data_sheet
     contrast = [100 * math.expm1(theta) for theta in (evs.contrast_threshold_on, evs.contrast_threshold_off)]
-    spread = evs.threshold_mismatch_std * (evs.contrast_threshold_on + evs.contrast_threshold_off) / 2
+    spread = evs.threshold_mismatch_rel * (evs.contrast_threshold_on + evs.contrast_threshold_off) / 2
     stated = (
         (None, None, None) if sheet is None else
         (sheet.threshold_on_percent, sheet.threshold_off_percent, sheet.threshold_mismatch_percent)

@@ -29,7 +29,7 @@ EVENTS: dict[str, Definition] = {
         "p(s) = q + (1 − q)·Φ((s − θᵢ)/σ), θᵢ ~ N(θ, τ²), s = ln(L₁/L₀)",
         "steps of several contrasts from one light, each many times; likelihood of the counts of every pixel",
     ),
-    "threshold_spread": Definition(
+    "threshold_spread_percent": Definition(
         "spread of thresholds",
         "Standard deviation of the thresholds over pixels, relative to their mean.",
         "τ/θ", "as the threshold",
@@ -141,8 +141,9 @@ FRAMES: dict[str, Definition] = {
     "dsnu_e": Definition("DSNU", "Standard deviation of the offsets over pixels.", "s_y.dark/K", "dark series"),
     "prnu_percent": Definition("PRNU", "Standard deviation of the response over pixels, relative.",
                                "√(s_y² − s_y.dark²)/(μ_y − μ_y.dark)", "lit and dark series"),
-    "linearity_error": Definition("linearity error", "Mean deviation of the signal from a straight line, relative.",
-                                  "mean |δ_y|, 5 to 95 % of saturation", "pairs"),
+    "linearity_error_percent": Definition("linearity error",
+                                          "Mean deviation of the signal from a straight line, relative.",
+                                          "mean |δ_y|, 5 to 95 % of saturation", "pairs"),
     "row_noise_dn": Definition("temporal row noise", "Noise that the pixels of a row share.", "σ of row means",
                                "dark pairs and series"),
     "column_noise_dn": Definition("temporal column noise", "Noise that the pixels of a column share.",

@@ -49,7 +49,7 @@ def frame_figures(folder: str | Path, progress: Progress | None = None) -> Frame
     section = content(result)
     names = (
         "K", "responsivity", "quantum_efficiency", "temporal_dark_noise_e", "dark_current_e_per_s", "full_well_e",
-        "dsnu_e", "prnu_percent", "linearity_error", "row_noise_dn", "column_noise_dn",
+        "dsnu_e", "prnu_percent", "linearity_error_percent", "row_noise_dn", "column_noise_dn",
     )  # fmt: skip
     entries = {name: section[name] for name in names}
     entries |= _of_both(entries, result)

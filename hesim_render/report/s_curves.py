@@ -46,7 +46,8 @@ class SCurve:
     size : [k], ln units.
     share, error : [k], answered jumps, mean over pixels, and its standard error.
     chance : share that chance answers, by the fit.
-    entries : ``threshold``, ``threshold_spread``, ``pixel_noise``, ``contrast_sensitivity`` as entries of the report.
+    entries : ``threshold``, ``threshold_spread_percent``, ``pixel_noise``, ``contrast_sensitivity`` as entries of the
+        report.
     theta : θ, ln units, or NaN.
     width : standard deviation of the curve, ln units: noise and spread together.
     pixels : number of pixels.
@@ -92,7 +93,7 @@ def s_curve(responses: list[Responses], polarity: int, good: NDArray[np.bool_]) 
     lux = responses[0].steps.lux
     reason = _problem(sizes, share, chosen.size)
     if reason:
-        names = ("threshold", "threshold_spread", "pixel_noise", "contrast_sensitivity")
+        names = ("threshold", "threshold_spread_percent", "pixel_noise", "contrast_sensitivity")
         entries = dict.fromkeys(names, not_identifiable(reason))
         return SCurve(lux, sizes, share, error_of_share, np.nan, entries, np.nan, np.nan, chosen.size)
     fit = _Fit(sizes, hits.T, trials)
@@ -107,7 +108,7 @@ def s_curve(responses: list[Responses], polarity: int, good: NDArray[np.bool_]) 
     noise = spread + np.array([0.0, 0.0, 1.0, 0.0])
     entries = {
         "threshold": estimated(theta, error, "ln"),
-        "threshold_spread": _part(fit, values, covariance, spread, 100 * tau / theta, "%"),
+        "threshold_spread_percent": _part(fit, values, covariance, spread, 100 * tau / theta, "%"),
         "pixel_noise": _part(fit, values, covariance, noise, sigma, "ln"),
         "contrast_sensitivity": estimated(float(percent), float(slope * error), "%"),
     }

@@ -207,7 +207,7 @@ def _values(spec: SheetSensorSpec) -> dict[str, Any]:
     return {
         "contrast_threshold_on": figures.thresholds[0],
         "contrast_threshold_off": figures.thresholds[1],
-        "threshold_mismatch_std": figures.mismatch,
+        "threshold_mismatch_rel": figures.mismatch,
         "signal_reference": {**reference, "filter": "own" if len(names) == 1 else names[0]},
         "coefficients": [beta],
         "shot_law": figures.shot_law,

@@ -99,7 +99,7 @@ class LeakSpec(Strict):
     )
     rate_hz: float = Field(ge=0, le=1e6, description="ON events of a pixel of nominal threshold, in the dark, 1/s")
     rate_hz_per_dn: float = Field(0.0, ge=0, le=1e9, description="growth of that rate with the signal (drift)")
-    spread: float = Field(0.0, ge=0, lt=1, description="std over pixels of both together, relative (drift)")
+    spread_rel: float = Field(0.0, ge=0, lt=1, description="std over pixels of both together, relative (drift)")
     tail_hz: float = Field(
         0.0, ge=0, lt=MOST_TAIL_HZ, description="a share tail_hz/(tail_hz + r) of the pixels leaks faster by more than "
         "r (drift)"
@@ -107,7 +107,7 @@ class LeakSpec(Strict):
 
     @model_validator(mode="after")
     def _check(self) -> LeakSpec:
-        if self.process == "poisson" and (self.rate_hz_per_dn or self.spread or self.tail_hz):
+        if self.process == "poisson" and (self.rate_hz_per_dn or self.spread_rel or self.tail_hz):
             raise ValueError(
                 "rate_hz_per_dn, spread and tail_hz belong to process 'drift'; 'poisson' has rate_hz alone"
             )
@@ -194,7 +194,7 @@ class EvsSpec(SheetEvsSpec):
 
     contrast_threshold_on: float = Field(ge=1e-9, le=100)
     contrast_threshold_off: float = Field(ge=1e-9, le=100)
-    threshold_mismatch_std: float = Field(0.0, ge=0, lt=0.5, description="std over pixels of θ, relative")
+    threshold_mismatch_rel: float = Field(0.0, ge=0, lt=0.5, description="std over pixels of θ, relative")
     signal_reference: SignalReferenceSpec
     coefficients: list[EvsCoefficients] = Field(min_length=1, description="one for all, or one per event position")
     shot_law: Literal["linear", "sqrt"]

@@ -51,7 +51,7 @@ def event_figures(
     tile = sensor.spec.tile_rows
     where = [filters.index(sensor.spec.pixels[tile[i][j]].filter) for i, j in sensor.spec.positions("evs")]
     theta_on, theta_off = spec.contrast_threshold_on, spec.contrast_threshold_off
-    spread_on, spread_off = (spec.threshold_mismatch_std * theta for theta in (theta_on, theta_off))
+    spread_on, spread_off = (spec.threshold_mismatch_rel * theta for theta in (theta_on, theta_off))
     contrast, rate, missed = [], [], np.ones((len(channels), len(channels)))
     for position, column in enumerate(where):
         k = evs.table.each(itemgetter(position))

@@ -92,7 +92,7 @@ def test_photon_transfer_of_a_physical_sensor(tmp_path):
         assert section[name]["value"] == pytest.approx(true, rel=relative), name
     assert section["full_well_e"]["limited_by"] == "full well"
     # Full well counts photo-electrons and dark ones; the dark 40 e of the longest exposure lie within the 2 %.
-    assert section["linearity_error"]["value"] < 0.3
+    assert section["linearity_error_percent"]["value"] < 0.3
     assert section["prnu_percent"]["value"] is None
     assert "uniform" in section["prnu_percent"]["reason"]
     k, error = section["K"]["value"], section["K"]["standard_error"]

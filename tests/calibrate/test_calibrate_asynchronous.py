@@ -30,7 +30,7 @@ def scores(section, pixels):
     found = {
         name: (section[name]["value"], section[name]["standard_error"], truth)
         for name, truth in (
-            ("theta_on", pixels.theta_on), ("theta_off", pixels.theta_off), ("threshold_mismatch", pixels.mismatch),
+            ("theta_on", pixels.theta_on), ("theta_off", pixels.theta_off), ("threshold_mismatch_rel", pixels.mismatch),
             ("photoreceptor_cutoff_hz", pixels.cutoff_hz), ("leak_rate_hz", pixels.leak_hz),
         )
     }  # fmt: skip
@@ -108,7 +108,7 @@ def test_every_parameter_is_recovered(plain):
     _, section, _, _, _ = plain
     assert max(abs(z) for z in scores(section, TRUTH).values()) < 3.5
     assert section["shot_law"] == "sqrt" and section["shot_law_decisive"]
-    assert section["threshold_mismatch"]["standard_error"] < 0.02 * TRUTH.mismatch
+    assert section["threshold_mismatch_rel"]["standard_error"] < 0.02 * TRUTH.mismatch
     assert section["photoreceptor_cutoff_hz"]["standard_error"] < 0.03 * TRUTH.cutoff_hz
     for item in section["noise"]:
         assert item["value"] == pytest.approx(TRUTH.sigma(item["signal_dn"]), rel=0.02)
@@ -192,10 +192,10 @@ def test_other_mismatches_and_the_other_shot_law(tmp_path, mismatch, law):
     section = read_calibration(tmp_path / "c.yaml")["evs"]
     assert section["shot_law"] == law and section["bad_pixels"] == 0
     if mismatch:
-        item = section["threshold_mismatch"]
+        item = section["threshold_mismatch_rel"]
         assert abs(item["value"] - mismatch) < 3.5 * item["standard_error"]
     else:
-        assert section["threshold_mismatch"]["value"] < 0.01
+        assert section["threshold_mismatch_rel"]["value"] < 0.01
     for name, truth in (("theta_on", pixels.theta_on), ("theta_off", pixels.theta_off)):
         assert abs(section[name]["value"] - truth) < 3.5 * section[name]["standard_error"]
 
@@ -489,7 +489,7 @@ def test_a_calibrated_sensor_behaves_like_the_captured_one(session, tmp_path):
     again = hr.load_sensor("davis346", {"noise": str(folder / "calibration.yaml")}).crop(32, 32)
     spec = again.spec.evs
     assert spec.contrast_threshold_on == pytest.approx(0.2, rel=0.03)
-    assert spec.threshold_mismatch_std == pytest.approx(0.15, rel=0.12)
+    assert spec.threshold_mismatch_rel == pytest.approx(0.15, rel=0.12)
     assert spec.photoreceptor_cutoff_hz == pytest.approx(300, rel=0.06)
     assert again.evs.threshold_on_map.std() == pytest.approx(sensor.evs.threshold_on_map.std(), rel=0.1)
     write_captures(

@@ -63,7 +63,7 @@ def compare(folder, section):
     value, error = fitted(section)
     line = np.linspace(0, 40.5, 150)
     theta_v, mismatch = known["theta_hardware_v"], known["theta_mismatch"]
-    measured = curve(*value, theta_v, line, section["threshold_mismatch"]["value"])
+    measured = curve(*value, theta_v, line, section["threshold_mismatch_rel"]["value"])
     return (value - x) / error, np.abs(measured / curve(*x, theta_v, line, mismatch) - 1).max(), known, error
 
 
@@ -127,8 +127,8 @@ def test_threshold_without_mismatch(plain):
     known = capture_sets.truth(folder)
     assert section["theta"]["value"] == pytest.approx(known["theta_ln"], rel=1e-3)
     assert abs(section["theta"]["value"] - known["theta_ln"]) < 4.5 * section["theta"]["standard_error"]
-    assert section["threshold_mismatch"]["value"] == 0
-    assert section["threshold_mismatch"]["upper_limit"] < 0.01
+    assert section["threshold_mismatch_rel"]["value"] == 0
+    assert section["threshold_mismatch_rel"]["upper_limit"] < 0.01
     assert section["asymmetry"]["value"] == 0 and section["leak_per_trial"]["value"] == 0
 
 
@@ -139,10 +139,15 @@ def test_mismatch_is_recovered_and_part_of_the_fit(mismatched):
     assert worst < 0.008
     assert section["theta"]["value"] == pytest.approx(known["theta_ln"], rel=5e-3)
     assert abs(section["theta"]["value"] - known["theta_ln"]) < 4.5 * section["theta"]["standard_error"]
-    assert section["threshold_mismatch"]["value"] == pytest.approx(0.03, rel=0.1)
-    low, high = section["threshold_mismatch"]["interval_95"]
+    assert section["threshold_mismatch_rel"]["value"] == pytest.approx(0.03, rel=0.1)
+    low, high = section["threshold_mismatch_rel"]["interval_95"]
     assert low < 0.03 < high + 0.0005
-    for item in (section["threshold_mismatch"], section["theta"], section["theta_on"], section["s_curve"]["ceiling"]):
+    for item in (
+        section["threshold_mismatch_rel"],
+        section["theta"],
+        section["theta_on"],
+        section["s_curve"]["ceiling"],
+    ):
         low, high = item["interval_95"]
         # Student's factor of 100 groups
         assert high - low == pytest.approx(2 * 1.98422 * item["standard_error"], rel=2e-3)
@@ -159,8 +164,8 @@ def test_mismatch_from_the_static_counts_alone(tmp_path):
     capture_sets.write_events(tmp_path / "set", size=(120, 136), trials=20000, mismatch=0.05)
     calibrate_evs(tmp_path / "set", tmp_path / "c.yaml")
     section = read_calibration(tmp_path / "c.yaml")["evs"]
-    assert section["threshold_mismatch"]["value"] == pytest.approx(0.05, rel=0.06)
-    assert section["threshold_mismatch"]["from"] == "static counts"
+    assert section["threshold_mismatch_rel"]["value"] == pytest.approx(0.05, rel=0.06)
+    assert section["threshold_mismatch_rel"]["from"] == "static counts"
     assert section["theta"]["value"] is None and "evs_steps" in section["theta"]["reason"]
     value, error = fitted(section)
     assert np.abs((value - [29.0, 6240.0, 0.03, 0.0]) / error).max() < 4.5
@@ -178,7 +183,7 @@ def test_large_mismatch_is_recovered_from_steps_and_from_the_static_counts_alone
     for folder, source, bad in ((both, "steps", injected), (tmp_path / "set", "static counts", 0 * injected)):
         calibrate_evs(folder, tmp_path / f"{source}.yaml")
         section = read_calibration(tmp_path / f"{source}.yaml")["evs"]
-        found = section["threshold_mismatch"]
+        found = section["threshold_mismatch_rel"]
         assert found["from"] == source
         assert abs(found["value"] - mismatch) < 4 * found["standard_error"]
         assert found["standard_error"] < 0.03 * mismatch
@@ -398,7 +403,7 @@ def test_event_probability_is_as_good_as_the_counts_allow(tmp_path, mismatch):
         distance.append((value - x) @ np.linalg.solve(covariance, value - x))
         assert np.abs(z).max() < 4
         assert section["theta"]["value"] == pytest.approx(known["theta_ln"], rel=1e-3 if mismatch == 0 else 5e-3)
-        assert section["threshold_mismatch"]["value"] == pytest.approx(mismatch, rel=0.1)
+        assert section["threshold_mismatch_rel"]["value"] == pytest.approx(mismatch, rel=0.1)
         assert max(section["multi_start"]["largest_difference_in_standard_errors"]) < 0.01
     # The best fit's distance has a χ² law of 4 degrees of freedom. Ours may lose a tenth; upper limit at 1e-4.
     assert np.sum(distance) < 1.1 * chi2.isf(1e-4, 4 * 40)
@@ -486,7 +491,7 @@ def test_virtual_sessions_cover_their_mismatch(tmp_path, name, mismatch, seeds):
     """
     covered, bad, alarms, pixels = 0, 0, 0, 0
     for seed in seeds:
-        sensor = hr.load_sensor(name, {"evs.threshold_mismatch_std": mismatch, "device_seed": 10_000 + seed})
+        sensor = hr.load_sensor(name, {"evs.threshold_mismatch_rel": mismatch, "device_seed": 10_000 + seed})
         side = next(k for k in (64, 128, 256) if sensor.crop(k, k).evs.layout.evs_shape[0] >= 64)
         captures = tmp_path / str(seed)
         exposures = (1000, 5000)
@@ -496,7 +501,7 @@ def test_virtual_sessions_cover_their_mismatch(tmp_path, name, mismatch, seeds):
         )  # fmt: skip
         calibrate_evs(captures, tmp_path / "c.yaml")
         section = read_calibration(tmp_path / "c.yaml")["evs"]
-        low, high = section["threshold_mismatch"]["interval_95"]
+        low, high = section["threshold_mismatch_rel"]["interval_95"]
         covered += low < mismatch < high
         bad += section["bad_pixels"]
         alarms += len(section["findings"])
@@ -512,7 +517,7 @@ def test_virtual_sessions_cover_their_mismatch(tmp_path, name, mismatch, seeds):
 @pytest.mark.slow
 def test_searches_end_at_one_point_where_a_threshold_nearly_vanishes(tmp_path):
     """This device has one: pooled with others it drew the likelihood of all to a degenerate end far away."""
-    sensor = hr.load_sensor("eiger", {"evs.threshold_mismatch_std": 0.25, "device_seed": 10_177}).crop(128, 128)
+    sensor = hr.load_sensor("eiger", {"evs.threshold_mismatch_rel": 0.25, "device_seed": 10_177}).crop(128, 128)
     exposures = (1000, 5000)
     write_captures(sensor, tmp_path / "c", seed=177, frames=8, dark_exposures_us=exposures, lit_exposures_us=exposures)
     calibrate_evs(tmp_path / "c", tmp_path / "c.yaml")

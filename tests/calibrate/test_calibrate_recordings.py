@@ -39,7 +39,7 @@ def sensor(seed):
     moving = target_events(rng, on, off, RISE, hz=5.0, cycles=12, shape=SHAPE, sigma=0.001,
                            drift=current * (dark + growth * 250.0))  # fmt: skip
     more = 1 + mismatch**2  # mean of 1/θ
-    truth = {"theta_on": theta_on, "theta_off": theta_off, "threshold_mismatch": mismatch,
+    truth = {"theta_on": theta_on, "theta_off": theta_off, "threshold_mismatch_rel": mismatch,
              "threshold_ratio": theta_off / theta_on, "leak_dark_hz": dark * more,
              "leak_growth_hz_per_lux": growth * more}  # fmt: skip
     return truth, events, moving
@@ -91,7 +91,7 @@ def test_files_of_any_format_give_the_figures_and_a_file_of_them(tmp_path):
         names[:3], out, lux=LUX, target_file=names[3], target_contrast=np.exp(RISE), shape=SHAPE,
         progress=lambda what, part: steps.append((what, part)),
     )  # fmt: skip
-    for name in ("theta_on", "theta_off", "threshold_mismatch", "leak_dark_hz", "leak_growth_hz_per_lux"):
+    for name in ("theta_on", "theta_off", "threshold_mismatch_rel", "leak_dark_hz", "leak_growth_hz_per_lux"):
         assert abs(found[name]["value"] - truth[name]) < 4 * found[name]["standard_error"], name
     assert found["findings"] == []
     assert [entry["lux"] for entry in found["recordings"]] == list(LUX)

@@ -62,7 +62,7 @@ def test_values_of_fixed_comparisons(hardware, volts, measured, theta):
     evs = SimpleNamespace(
         theta_hardware_v=hardware, theta=item(measured), theta_on=item(None), theta_off=item(None), asymmetry=item(0.1),
         positions=[position(200.0, 8.0, 0.3, 0.05), position(100.0, 4.0, None, 0.02)], A=item(180.0), B=item(5.0),
-        C=item(None), D=item(None), threshold_mismatch=item(0.06), shot_law="sqrt", leak_rate_hz=item(0.35),
+        C=item(None), D=item(None), threshold_mismatch_rel=item(0.06), shot_law="sqrt", leak_rate_hz=item(0.35),
     )  # fmt: skip
     found = _evs_values(sensor, evs, SimpleNamespace(path=FILE))
     first, second = theta / volts / 8, theta / volts / 5
@@ -71,7 +71,7 @@ def test_values_of_fixed_comparisons(hardware, volts, measured, theta):
         pytest.approx({"beta1": 36.0, "beta2": 1.0, "beta3": 0.0, "beta4": second, "beta5": 0.0}),
     ]
     thresholds = {"contrast_threshold_on": 0.9 * theta, "contrast_threshold_off": 1.1 * theta}
-    rest = {"threshold_mismatch_std": 0.06, "shot_law": "sqrt", "leak_rate_hz": 0.35}
+    rest = {"threshold_mismatch_rel": 0.06, "shot_law": "sqrt", "leak_rate_hz": 0.35}
     assert found.pop("shot_law") == rest.pop("shot_law")
     assert found == pytest.approx(thresholds | rest | ({} if hardware is None else {"threshold_hardware_v": hardware}))
 
@@ -79,10 +79,11 @@ def test_values_of_fixed_comparisons(hardware, volts, measured, theta):
 def test_values_of_asynchronous_pixels():
     evs = SimpleNamespace(
         beta=[[9.0, 1.5, 1.0, 0.3, 0.02, 0.4]], theta_on=item(0.21), theta_off=item(0.27),
-        threshold_mismatch=item(0.05), shot_law="linear", leak_rate_hz=item(-0.01), photoreceptor_cutoff_hz=item(310.0),
+        threshold_mismatch_rel=item(0.05), shot_law="linear", leak_rate_hz=item(-0.01),
+        photoreceptor_cutoff_hz=item(310.0),
     )  # fmt: skip
     assert _asynchronous_values({"evs": {"reference": "last_event"}}, evs, FILE) == {
-        "contrast_threshold_on": 0.21, "contrast_threshold_off": 0.27, "threshold_mismatch_std": 0.05,
+        "contrast_threshold_on": 0.21, "contrast_threshold_off": 0.27, "threshold_mismatch_rel": 0.05,
         "coefficients": [{"beta1": 1.5, "beta2": 1.0, "beta3": 0.3, "beta4": 0.02, "beta5": 0.4}],
         "shot_law": "linear", "leak_rate_hz": 0.0, "photoreceptor_cutoff_hz": 310.0,
     }  # fmt: skip

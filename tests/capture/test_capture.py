@@ -65,7 +65,7 @@ def test_exposures_end_inside_the_run_and_carry_their_times():
 
 def test_a_source_that_takes_one_window_after_another_hands_on_its_pixels():
     """Fixed comparisons: exact runs and videos go on where they stopped, with all noise."""
-    sensor = hr.load_sensor("gen2", {"evs.threshold_mismatch_std": 0.05}).crop(24, 16)
+    sensor = hr.load_sensor("gen2", {"evs.threshold_mismatch_rel": 0.05}).crop(24, 16)
 
     def part(begin_us, end_us, pixels=None):
         capture = Capture(WaveFlux(sensor), sensor, *noise_models(sensor), end_us, 3, begin_us=begin_us, pixels=pixels)

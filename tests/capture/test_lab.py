@@ -26,7 +26,7 @@ from hesim_render.spectral import spectrum as spectra
 
 # eiger with lower thresholds and a wider mismatch: a short session then holds enough events
 BUSY = {
-    "evs.contrast_threshold_on": 0.15, "evs.contrast_threshold_off": 0.153, "evs.threshold_mismatch_std": 0.05,
+    "evs.contrast_threshold_on": 0.15, "evs.contrast_threshold_off": 0.153, "evs.threshold_mismatch_rel": 0.05,
 }  # fmt: skip
 WIDE, HIGH, FRAMES, TICKS = 144, 112, 32, 6000
 
@@ -150,7 +150,7 @@ def test_the_truth_stands_beside_the_estimate(session):
         "aps": {"K": aps.system_gain_dn_per_e, "read_noise_e": aps.read_noise_e, "dsnu_e": aps.dsnu_e,
                 "dark_current_e_per_s": aps.dark_current_e_per_s, "prnu_percent": 100 * aps.prnu_rel},
         "evs": {"theta_on": evs.contrast_threshold_on, "theta_off": evs.contrast_threshold_off,
-                "threshold_mismatch": evs.threshold_mismatch_std, "D": one.beta5, "C": one.beta3 / one.beta4,
+                "threshold_mismatch_rel": evs.threshold_mismatch_rel, "D": one.beta5, "C": one.beta3 / one.beta4,
                 "B": theta / evs.threshold_hardware_v * one.beta2 / one.beta4,
                 "A": theta / evs.threshold_hardware_v * one.beta1 / one.beta4},
     }  # fmt: skip
@@ -176,7 +176,7 @@ def test_the_truth_knows_what_is_off_or_mixed():
     found = truth_of(set_up(sensor, LIT_EXPOSURES_US, without=off), 80_000)
     gain = sensor.spec.aps.system_gain_dn_per_e
     assert found["aps"]["read_noise_e"] == pytest.approx(0.6 / gain)
-    assert found["aps"]["dsnu_e"] == found["aps"]["dark_current_e_per_s"] == found["evs"]["threshold_mismatch"] == 0
+    assert found["aps"]["dsnu_e"] == found["aps"]["dark_current_e_per_s"] == found["evs"]["threshold_mismatch_rel"] == 0
     assert found["evs"]["leak_per_trial"] == pytest.approx(1 - np.exp(-3.0 * sensor.spec.evs.tick_us * 1e-6))
     assert not {"A", "B", "C", "D"} & set(found["evs"])
     aps = sensor.spec.aps
@@ -328,7 +328,7 @@ def test_first_events_of_trials_fall_into_the_bins_that_end_with_their_instant(t
 @pytest.mark.slow
 def test_event_counts_follow_the_closed_form(tmp_path):
     """Rates per pixel against P = Q(θ/σ) of nominal thresholds, written out; per-instant noise over-disperses."""
-    sensor = hr.load_sensor("eiger", {**BUSY, "evs.threshold_mismatch_std": 0.0}).crop(128, 128)
+    sensor = hr.load_sensor("eiger", {**BUSY, "evs.threshold_mismatch_rel": 0.0}).crop(128, 128)
     write_captures(sensor, tmp_path / "c", frames=8, ticks=4000, seed=11)
     static, steps = arrays(tmp_path / "c" / "evs_static.npz"), arrays(tmp_path / "c" / "evs_steps.npz")
 
@@ -403,7 +403,7 @@ def test_calibrated_values_replace_the_files_own(session):
         assert found == pytest.approx([position[name]["value"] for name in "ABCD"])
     relative = sensor.evs.threshold_on_map / spec.evs.contrast_threshold_on
     good = ~read_maps(calibration, "evs")["bad_pixels"]
-    assert relative[good].std() == pytest.approx(spec.evs.threshold_mismatch_std, rel=1e-4)
+    assert relative[good].std() == pytest.approx(spec.evs.threshold_mismatch_rel, rel=1e-4)
     true = hr.load_sensor("eiger", BUSY).crop(WIDE, HIGH).evs.threshold_on_map / 0.15
     assert np.corrcoef(relative[good], true[good])[0, 1] > 0.8  # the pixels' own thresholds, not another draw
     assert spec.sources["aps.system_gain_dn_per_e"].startswith("measured: ")

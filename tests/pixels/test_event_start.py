@@ -47,7 +47,7 @@ def counts(noise, until_us, seed=5, electrons=0.0, **keys):
 
 
 @pytest.mark.parametrize("changes", (
-    {}, {"evs__threshold_mismatch_std": 0.1}, {"evs__refractory_period_us": 150, "evs__threshold_mismatch_std": 0.1},
+    {}, {"evs__threshold_mismatch_rel": 0.1}, {"evs__refractory_period_us": 150, "evs__threshold_mismatch_rel": 0.1},
     {"evs__refractory_period_us": 1500, "evs__leak_rate_hz": 2.0}, {"evs__refractory_period_us": 90_000},
 ), ids=("plain", "mismatch", "dead-time", "leak", "long-dead-time"))  # fmt: skip
 def test_the_rate_of_noise_events_does_not_depend_on_time(changes):
@@ -79,7 +79,7 @@ def test_comparisons_of_successive_samples_have_no_beginning():
 
 def test_the_start_is_the_same_for_any_region_and_continues():
     """Events of a region are those of the whole sensor there; a resumed stage continues bit by bit."""
-    whole = pixels(evs__refractory_period_us=150, evs__threshold_mismatch_std=0.1)
+    whole = pixels(evs__refractory_period_us=150, evs__threshold_mismatch_rel=0.1)
     part = EvsNoise(whole.spec, Layout(whole.layout.spec, 24, 8, 40, 56), whole.device_seed, np.ones(1))
 
     def run(noise, times_us, stop=None):

@@ -487,7 +487,7 @@ def test_recording_tells_what_was_lost(tmp_path):
 
 ALL = {
     "evs__photoreceptor": FOLLOWING, "evs__refractory_period_us": 500, "evs__readout_max_events_per_s": 1e5,
-    "evs__leak_rate_hz": 5.0, "evs__threshold_mismatch_std": 0.1,
+    "evs__leak_rate_hz": 5.0, "evs__threshold_mismatch_rel": 0.1,
     "evs__coefficients": [{"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 0.1, "beta5": 0.0}],
 }  # fmt: skip
 
@@ -495,7 +495,7 @@ ALL = {
 def test_switched_off_they_leave_no_trace():
     """With the terms off by name, events are bit for bit those of a file without the keys."""
     plain = asynchronous(
-        **{k: ALL[k] for k in ("evs__leak_rate_hz", "evs__threshold_mismatch_std", "evs__coefficients")}
+        **{k: ALL[k] for k in ("evs__leak_rate_hz", "evs__threshold_mismatch_rel", "evs__coefficients")}
     )
     limited = asynchronous(**ALL).without("bandwidth", "refractory", "readout_limit")
     level = np.random.default_rng(0).uniform(0, 3, (20, 16, 16))

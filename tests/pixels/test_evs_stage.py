@@ -151,7 +151,7 @@ def same_law_p(a, b):
 def test_numpy_version_of_previous_sample_agrees(noise_mode):
     """Counts of ON, OFF, both and their difference per pixel, mismatch and leak on; 8 × 1e-7."""
     noise = model(evs__noise_mode=noise_mode, evs__contrast_threshold_on=0.3, evs__contrast_threshold_off=0.32,
-                  evs__threshold_mismatch_std=0.1, evs__leak_rate_hz=5.0)  # fmt: skip
+                  evs__threshold_mismatch_rel=0.1, evs__leak_rate_hz=5.0)  # fmt: skip
     electrons = np.broadcast_to(np.geomspace(5, 500, 512), (512, 512))
     ours = counts_of(EvsStage(noise, seed=2), noise, on_device(electrons), 30)
     theirs = [c.ravel() for c in numpy_previous_sample(noise, electrons, 30, np.random.default_rng(3))]
@@ -311,7 +311,7 @@ def test_numpy_version_of_last_event_agrees():
 
     The wedge of light makes the noise differ between pixels. Both sides sample the light at the nodes.
     """
-    noise = asynchronous(128, evs__threshold_mismatch_std=0.1, evs__contrast_threshold_off=0.22)
+    noise = asynchronous(128, evs__threshold_mismatch_rel=0.1, evs__contrast_threshold_off=0.22)
     wedge = np.broadcast_to(np.linspace(0.0, 0.3, 128), (128, 128)).ravel()
     duration_us, period_us = 100_000, 1e6 / (16 * 300.0)
 
@@ -418,7 +418,7 @@ def test_noise_follows_the_current_signal():
 
 @pytest.mark.parametrize("build", (model, asynchronous))
 def test_static_scene_is_silent_without_noise(build):
-    noise = build(64, evs__leak_rate_hz=100.0, evs__threshold_mismatch_std=0.2).clean()
+    noise = build(64, evs__leak_rate_hz=100.0, evs__threshold_mismatch_rel=0.2).clean()
     stage = EvsStage(noise, seed=1)
     electrons = on_device(np.random.default_rng(0).uniform(0, 1000, 64 * 64))
     for t_us in (0, 1000, 1700, 50_000):
@@ -428,7 +428,7 @@ def test_static_scene_is_silent_without_noise(build):
 
 @pytest.mark.parametrize("build", (model, asynchronous))
 def test_crop_gives_the_full_sensors_events(build):
-    changes = {"evs__threshold_mismatch_std": 0.1, "evs__leak_rate_hz": 30.0}
+    changes = {"evs__threshold_mismatch_rel": 0.1, "evs__leak_rate_hz": 30.0}
     full, crop = build(128, **changes), build(128, crop=(48, 32), **changes)
     top, left = crop.layout.row0, crop.layout.col0
     image = np.random.default_rng(0).uniform(0, 20, (128, 128))

@@ -63,7 +63,7 @@ TICKS = 1_000 * np.arange(1, 101)
 
 def test_labels_change_no_event_and_count_every_one():
     for asynchronous in (False, True):
-        noise = model(asynchronous, evs__threshold_mismatch_std=0.05, evs__leak_rate_hz=1.3)
+        noise = model(asynchronous, evs__threshold_mismatch_rel=0.05, evs__leak_rate_hz=1.3)
         events, found = run(noise, TICKS)
         without, _ = run(noise, TICKS, labels=False)
         np.testing.assert_array_equal(events, without)
@@ -72,7 +72,7 @@ def test_labels_change_no_event_and_count_every_one():
 
 
 def test_with_fixed_ticks_signal_and_mismatch_are_the_events_of_runs_without_noise():
-    noise = model(evs__threshold_mismatch_std=0.1, evs__leak_rate_hz=5.0)
+    noise = model(evs__threshold_mismatch_rel=0.1, evs__leak_rate_hz=5.0)
     events, found = run(noise, TICKS, lambda t: light(t, hz=60.0))
     clean, _ = run(noise.clean(), TICKS, lambda t: light(t, hz=60.0), labels=False)
     own, _ = run(noise.without(*NOISES), TICKS, lambda t: light(t, hz=60.0), labels=False)
@@ -90,7 +90,7 @@ def test_with_fixed_ticks_signal_and_mismatch_are_the_events_of_runs_without_noi
 
 def test_with_fixed_ticks_the_change_of_the_light_itself_decides():
     """From the levels that are put in: p·Δ ln x > θ, of the nominal threshold and of the pixel's own."""
-    noise = model(evs__threshold_mismatch_std=0.1, evs__contrast_threshold_off=0.25)
+    noise = model(evs__threshold_mismatch_rel=0.1, evs__contrast_threshold_off=0.25)
     events, found = run(noise, TICKS, lambda t: light(t, hz=60.0))
     place = events["y"].astype(int) * COLS + events["x"]
     levels = np.array([light(t, hz=60.0) for t in [0, *TICKS]])
@@ -146,7 +146,7 @@ def test_asynchronous_signal_has_the_rate_of_the_run_without_noise(noise_dn, spr
     thresholds of both polarities have one mean: where they differ, noise moves the reference level itself (docs).
     """
     coefficients = {**NOISY, "beta4": noise_dn}
-    noise = model(True, coefficients, evs__threshold_mismatch_std=spread, evs__leak_rate_hz=1.3,
+    noise = model(True, coefficients, evs__threshold_mismatch_rel=spread, evs__leak_rate_hz=1.3,
                   evs__contrast_threshold_off=THETA)  # fmt: skip
     times = 500 * np.arange(1, 451)
     events, found = run(noise, times)
@@ -167,7 +167,7 @@ def test_asynchronous_signal_has_the_rate_of_the_run_without_noise(noise_dn, spr
 
 def test_noise_of_still_light_is_not_signal():
     """From the first moment on, as pixels begin in the state that they have in this light."""
-    noise = model(True, evs__threshold_mismatch_std=0.05)
+    noise = model(True, evs__threshold_mismatch_rel=0.05)
     events, found = run(noise, 1_000 * np.arange(1, 181), lambda t: np.full(SIZE, np.log(101.0)))
     assert events.size > 300 and (found.label == Label.NOISE).mean() > 0.998
     assert found.clean.size == 0
@@ -217,7 +217,7 @@ def test_with_a_dead_time_signal_has_the_rate_of_the_run_without_noise_but_with_
     noise is a quarter of the threshold, noise is in the reference at the release, so that pixels fire more often or
     less: docs/ground-truth.md states 1 % and 3 %.
     """
-    noise = model(True, {**NOISY, "beta4": noise_dn}, evs__threshold_mismatch_std=0.05,
+    noise = model(True, {**NOISY, "beta4": noise_dn}, evs__threshold_mismatch_rel=0.05,
                   evs__refractory_period_us=dead_us)  # fmt: skip
     times = 500 * np.arange(1, 451)
     events, found = run(noise, times)
@@ -264,7 +264,7 @@ def steps_worked_out(level, own, nominal):
 
 def test_a_step_is_signal_if_the_level_goes_on_to_the_nominal_threshold_before_the_pixel_steps_back():
     """Asynchronous pixels without noise, so that every event is a step with the pixel's own threshold."""
-    noise = model(True, {**NOISY, "beta4": 0.0}, evs__threshold_mismatch_std=0.15, evs__contrast_threshold_off=0.25)
+    noise = model(True, {**NOISY, "beta4": 0.0}, evs__threshold_mismatch_rel=0.15, evs__contrast_threshold_off=0.25)
     times = 500 * np.arange(1, 121)
     levels = wandering(int(times[-1]))
     events, found = run(noise, times, lambda t: levels[t // 500])
@@ -288,7 +288,7 @@ def test_a_step_is_signal_if_the_level_goes_on_to_the_nominal_threshold_before_t
 @pytest.mark.parametrize("dead_us", [None, pytest.param(300, marks=pytest.mark.slow)])
 def test_labels_neither_drift_nor_need_more_memory_as_time_goes_on(dead_us):
     """Lamps that blink, by 5 thresholds between two samples, with noise and thresholds of each pixel's own."""
-    noise = model(True, {**NOISY, "beta4": 2.0}, evs__threshold_mismatch_std=0.1, evs__leak_rate_hz=1.3,
+    noise = model(True, {**NOISY, "beta4": 2.0}, evs__threshold_mismatch_rel=0.1, evs__leak_rate_hz=1.3,
                   **({} if dead_us is None else {"evs.refractory_period_us": dead_us}))  # fmt: skip
     labeller = Labeller(noise, 9, 0, 10**9)
     stage = EvsStage(noise, 9, labels=labeller)
@@ -310,7 +310,7 @@ def test_labels_neither_drift_nor_need_more_memory_as_time_goes_on(dead_us):
 
 
 def test_what_is_let_go_of_changes_no_label(monkeypatch):
-    noise = model(True, evs__threshold_mismatch_std=0.1, evs__refractory_period_us=300)
+    noise = model(True, evs__threshold_mismatch_rel=0.1, evs__refractory_period_us=300)
     found = []
     for few in (0, 10**9):
         monkeypatch.setattr(partners, "_FEW", few)
@@ -326,7 +326,7 @@ def test_what_is_let_go_of_changes_no_label(monkeypatch):
 
 def test_labels_where_nothing_happens_between_two_samples():
     """One rise by 0.195 at once, in reach of some thresholds; later a slow one by 0.02, past the nominal 0.2."""
-    noise = model(True, {**NOISY, "beta4": 0.0}, evs__threshold_mismatch_std=0.1)
+    noise = model(True, {**NOISY, "beta4": 0.0}, evs__threshold_mismatch_rel=0.1)
 
     def rise(t_us):
         return np.full(SIZE, np.log(101.0) + 0.195 * (t_us > 500) + max(0, t_us - 20_000) * 1e-6)

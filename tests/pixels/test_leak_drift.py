@@ -30,7 +30,7 @@ def pixels(leak, sigma=0.0, **overrides):
     spec = read_sensor(
         "reference-mono",
         {"geometry.rows": SHAPE[0], "geometry.cols": SHAPE[1], "evs.coefficients": [beta],
-         "evs.reference": "last_event", "evs.photoreceptor_cutoff_hz": CUTOFF_HZ, "evs.threshold_mismatch_std": 0.0,
+         "evs.reference": "last_event", "evs.photoreceptor_cutoff_hz": CUTOFF_HZ, "evs.threshold_mismatch_rel": 0.0,
          "evs.contrast_threshold_on": THETA_ON, "evs.contrast_threshold_off": THETA_OFF, "evs.leak": leak, **changes},
     )  # fmt: skip
     return EvsNoise(spec.evs, Layout.full(spec), spec.device_seed, np.full(1, 1.3))
@@ -71,8 +71,8 @@ def numpy_pixels(rng, rate_hz, sigma, span_s, warm_s):
 
 def test_without_noise_intervals_are_those_of_each_pixels_own_current():
     """Currents of the dark, of the light and of the tail, over each pixel's own threshold; intervals are equal."""
-    leak = {"process": "drift", "rate_hz": 3.1, "rate_hz_per_dn": 0.07, "spread": 0.2, "tail_hz": 1.7}
-    noise = pixels(leak, evs__threshold_mismatch_std=0.12)
+    leak = {"process": "drift", "rate_hz": 3.1, "rate_hz_per_dn": 0.07, "spread_rel": 0.2, "tail_hz": 1.7}
+    noise = pixels(leak, evs__threshold_mismatch_rel=0.12)
     electrons = 4.3
     t_us, place, polarity = run(noise, (170_000, 1_000_003, 3_000_000), electrons)
     assert np.all(polarity == 1)
@@ -148,8 +148,8 @@ def test_the_rate_does_not_depend_on_time(changes):
     """Noise events and drift together: the first 0.3 s against the 1.2 s after them, within 10 %: the law with which
     pixels begin takes drift and noise one after the other. From a reset it would be 40 % of ON events too few.
     """
-    leak = {"process": "drift", "rate_hz": 1.4, "spread": 0.25}
-    noise = pixels(leak, 0.062, evs__threshold_mismatch_std=0.09, **changes)
+    leak = {"process": "drift", "rate_hz": 1.4, "spread_rel": 0.25}
+    noise = pixels(leak, 0.062, evs__threshold_mismatch_rel=0.09, **changes)
     t_us, _, polarity = run(noise, (300_000, 1_500_000))
     for sign in (1, -1):
         early = np.count_nonzero((t_us <= 300_000) & (polarity == sign)) / 0.3
@@ -159,7 +159,7 @@ def test_the_rate_does_not_depend_on_time(changes):
 
 def test_steps_do_not_matter():
     """Two samples or two hundred, and more than 4 ln units of drift on the way: the same events to 30 µs."""
-    noise = pixels({"process": "drift", "rate_hz": 40.0, "spread": 0.3})
+    noise = pixels({"process": "drift", "rate_hz": 40.0, "spread_rel": 0.3})
     few, many = (run(noise, np.linspace(0, 1_500_000, count + 1)[1:]) for count in (2, 200))
     assert few[0].size > 50 * PIXELS
     counts = [np.bincount(found[1], minlength=PIXELS) for found in (few, many)]
@@ -192,7 +192,7 @@ def test_changing_light_is_integrated():
 
 def test_an_on_event_is_the_drifts_from_half_a_threshold_on():
     """At 2 Hz the drift has passed 0.45 and 0.55 of a threshold after 225 and 275 ms; OFF events are never its own."""
-    drift = LeakDrift(pixels({"process": "drift", "rate_hz": 2.0, "rate_hz_per_dn": 0.0, "spread": 0.0}))
+    drift = LeakDrift(pixels({"process": "drift", "rate_hz": 2.0, "rate_hz_per_dn": 0.0, "spread_rel": 0.0}))
     dark = jit().Float(np.zeros(PIXELS, np.float32))
     drift.start(dark, True, np.zeros(PIXELS), np.zeros(PIXELS))
     given = [(225, 3, 1, 1), (275, 4, 1, 1), (290, 2, 7, -1), (490, 4, 1, 1), (530, 3, 1, 1), (560, 2, 7, 1)]
@@ -206,7 +206,7 @@ def test_origin_and_label():
     """Without a light signal all events of a drift are leak; steps of light in between stay signal, but for the half
     event that a drifted reference gives in addition.
     """
-    noise = pixels({"process": "drift", "rate_hz": 4.0, "spread": 0.1})
+    noise = pixels({"process": "drift", "rate_hz": 4.0, "spread_rel": 0.1})
     labeller = Labeller(noise, 3, 0, 10**9)
     stage = EvsStage(noise, 3, labels=labeller)
     bright = jit().Float(np.full(PIXELS, 9.0, np.float32))
@@ -255,7 +255,7 @@ def test_the_mean_rate_is_that_of_its_law():
 
 @pytest.mark.parametrize(("changes", "told"), (
     ({"evs.leak": {"process": "drift", "rate_hz": 1.0}, "evs.reference": "previous_sample"}, "a fixed tick"),
-    ({"evs.leak": {"process": "poisson", "rate_hz": 1.0, "spread": 0.2}}, "'poisson' has rate_hz alone"),
+    ({"evs.leak": {"process": "poisson", "rate_hz": 1.0, "spread_rel": 0.2}}, "'poisson' has rate_hz alone"),
     ({"evs.leak": {"process": "poisson", "rate_hz": 1.0}, "evs.leak_rate_hz": 2.0}, "leave one of them out"),
 ), ids=("tick", "poisson-spread", "twice"))  # fmt: skip
 def test_keys_that_do_not_go_together(changes, told):

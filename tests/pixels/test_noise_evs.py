@@ -72,7 +72,7 @@ def test_device_level_matches(law):
 
 
 def test_positions():
-    noise = model("eiger", crop=(64, 64), scale=[1.0, 0.5, 2.0, 1.5], evs__threshold_mismatch_std=0.0)
+    noise = model("eiger", crop=(64, 64), scale=[1.0, 0.5, 2.0, 1.5], evs__threshold_mismatch_rel=0.0)
     known = noise.layout.spec.positions("evs")
     assert len(known) == 4
     by_number = [noise.event_probability(20.0, 22.0, position=p) for p in range(4)]
@@ -93,7 +93,7 @@ def test_positions():
 
 
 def test_images_use_each_pixels_thresholds():
-    noise = model("gen2", crop=(256, 256), evs__threshold_mismatch_std=0.1)
+    noise = model("gen2", crop=(256, 256), evs__threshold_mismatch_rel=0.1)
     image = np.full((64, 64), 5.0)
     p_on, p_off = noise.event_probability(image, image)
     b = noise.spec.coefficients[0]
@@ -105,7 +105,7 @@ def test_images_use_each_pixels_thresholds():
 
 def test_threshold_maps():
     """1048576 pixels; z = 5.5 each."""
-    noise = model(evs__threshold_mismatch_std=0.1, evs__contrast_threshold_on=0.2, evs__contrast_threshold_off=0.3)
+    noise = model(evs__threshold_mismatch_rel=0.1, evs__contrast_threshold_on=0.2, evs__contrast_threshold_off=0.3)
     on, off = noise.threshold_on_map / 0.2, noise.threshold_off_map / 0.3
     for relative in (on, off):
         assert abs(relative.mean() - 1) < 5.5 * 0.1 / 1024
@@ -116,13 +116,13 @@ def test_threshold_maps():
     np.testing.assert_array_equal(crop.threshold_on_map, noise.threshold_on_map[top : top + 50, left : left + 100])
     other = EvsNoise(noise.spec, noise.layout, noise.device_seed + 1, np.ones(1))
     assert abs(np.corrcoef(other.threshold_on_map.ravel(), noise.threshold_on_map.ravel())[0, 1]) < 5.5 / 1024
-    wide = model(evs__threshold_mismatch_std=0.45)
+    wide = model(evs__threshold_mismatch_rel=0.45)
     assert wide.threshold_on_map.min() == pytest.approx(LEAST_THRESHOLD_REL * wide.spec.contrast_threshold_on)
-    assert model(evs__threshold_mismatch_std=0.0).threshold_on_map == 0.1
+    assert model(evs__threshold_mismatch_rel=0.0).threshold_on_map == 0.1
 
 
 def test_terms():
-    noise = model(evs__coefficients=[{**COEFFICIENTS, "beta5": 0.0}], evs__threshold_mismatch_std=0.1,
+    noise = model(evs__coefficients=[{**COEFFICIENTS, "beta5": 0.0}], evs__threshold_mismatch_rel=0.1,
                   evs__leak_rate_hz=2.0, evs__shot_law="sqrt")  # fmt: skip
     electrons = jit().Float(20.0)
 

@@ -365,7 +365,7 @@ def test_amplitudes_are_exponential():
 # ---- from captures to a sensor that misbehaves alike ---------------------------------------------------
 
 BROKEN = {
-    "evs.contrast_threshold_on": 0.15, "evs.contrast_threshold_off": 0.153, "evs.threshold_mismatch_std": 0.05,
+    "evs.contrast_threshold_on": 0.15, "evs.contrast_threshold_off": 0.153, "evs.threshold_mismatch_rel": 0.05,
     "evs.defects": {
         "stuck_share": 0.004, "hot_share": 0.006, "hot_rate_hz": 120.0, "hot_rate_spread_decades": 0.2,
         "flickering_share": 0.006, "flickering_rate_hz": 150.0, "flickering_firing_s": 0.15, "flickering_quiet_s": 0.3,

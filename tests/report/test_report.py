@@ -154,7 +154,7 @@ def test_what_cannot_be_told_says_why(tmp_path):
 
 def test_noise_or_spread_alone(tmp_path):
     """Where one of both makes the whole width, the other is 0 with a limit, and the threshold is right."""
-    for spread, noise, key in ((0.0, 0.1, "threshold_spread"), (0.12, 1e-7, "pixel_noise")):
+    for spread, noise, key in ((0.0, 0.1, "threshold_spread_percent"), (0.12, 1e-7, "pixel_noise")):
         pixels = Pixels(7)
         pixels.noise = noise * pixels.theta[0]
         pixels.own = pixels.theta[:, None] * (1 + spread * pixels.rng.standard_normal((2, PIXELS)))
@@ -300,7 +300,7 @@ def test_a_report_of_a_simulated_sensor(tmp_path):
     for name, own in (("ON", sensor.evs.threshold_on_map), ("OFF", sensor.evs.threshold_off_map)):
         value = entry_of(found.events, "threshold", name).value
         assert abs(value["value"] - own.mean()) < 0.02 * own.mean()  # the noise lowers it
-        spread = entry_of(found.events, "threshold_spread", name).value
+        spread = entry_of(found.events, "threshold_spread_percent", name).value
         assert abs(spread["value"] - 100 * own.std() / own.mean()) < 1.5
     assert found.events.entries[0].pixels <= 24 * 30
     frames, aps = found.frames.entries, sensor.spec.aps

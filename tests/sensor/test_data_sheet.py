@@ -165,7 +165,7 @@ def test_the_coefficients_have_the_figures_of_the_sheet():
     evs = read_sensor("imx636").evs
     assert evs.contrast_threshold_on == pytest.approx(math.log(1.25))
     # 2.5 % of contrast at 25 % is 0.02 in ln units
-    assert evs.threshold_mismatch_std * math.log(1.25) == pytest.approx(0.02)
+    assert evs.threshold_mismatch_rel * math.log(1.25) == pytest.approx(0.02)
     (beta,) = evs.coefficients
     assert (beta.beta1, beta.beta2, beta.beta5) == (1.0, 0.08, 0.0)
     # shot noise of light and dark current: σ² of 5 lx over that of 20 lx is (20 + L0)/(5 + L0)
@@ -183,7 +183,7 @@ def test_noise_that_the_corner_limits_has_the_rate_of_the_sheet():
     corner_hz = corner_at(evs.photoreceptor, 5)
     share = corner_hz / 90
     assert 0.6 < share < 0.7
-    noise = noise_sigma(10.0 - 0.1, (math.log(1.25),) * 2, evs.threshold_mismatch_std, corner_hz, 500e-6, 0.1)
+    noise = noise_sigma(10.0 - 0.1, (math.log(1.25),) * 2, evs.threshold_mismatch_rel, corner_hz, 500e-6, 0.1)
     assert variance * share == pytest.approx(noise**2, rel=1e-4)
 
 
@@ -199,7 +199,7 @@ def two_rates(tmp_path, first, second):
 
 def test_two_background_rates_tell_the_dark_current(tmp_path):
     (beta,) = two_rates(tmp_path, (50, 0.5), (2, 4.0)).evs.coefficients
-    theta, spread = (math.log(1.25),) * 2, read_sensor("imx636").evs.threshold_mismatch_std
+    theta, spread = (math.log(1.25),) * 2, read_sensor("imx636").evs.threshold_mismatch_rel
     for lux, rate_hz in ((50.0, 0.5), (2.0, 4.0)):
         sigma = math.sqrt(beta.beta3**2 * lux + beta.beta4**2) / (lux + beta.beta2)
         assert sum(noise_rates_hz(theta, spread, sigma, 150.0, 500e-6, 0.1)) == pytest.approx(rate_hz - 0.1, rel=1e-3)
@@ -209,7 +209,7 @@ def test_two_background_rates_tell_the_dark_current(tmp_path):
 def test_v2e_options_keep_their_meaning():
     evs = read_sensor("v2e-noisy").evs
     assert (evs.contrast_threshold_on, evs.contrast_threshold_off, evs.leak_rate_hz) == (0.2, 0.2, 0.1)
-    assert evs.threshold_mismatch_std == pytest.approx(0.05 / 0.2)
+    assert evs.threshold_mismatch_rel == pytest.approx(0.05 / 0.2)
     assert evs.refractory_period_us is None and evs.photoreceptor.cutoff_hz == 30
     for grey in (0, 77, 255):  # v2e's own law
         assert corner_at(evs.photoreceptor, 100 * grey / 255) == pytest.approx(30 * (grey + 20) / 275)
@@ -220,7 +220,7 @@ def test_v2e_options_keep_their_meaning():
     clean = read_sensor("v2e-clean").evs
     assert clean.photoreceptor is None and clean.leak_rate_hz == 0
     assert clean.coefficients[0].beta3 == clean.coefficients[0].beta4 == 0
-    assert clean.threshold_mismatch_std == pytest.approx(0.1)
+    assert clean.threshold_mismatch_rel == pytest.approx(0.1)
 
 
 def test_changes_reach_the_sheet_and_have_the_last_word():
@@ -278,7 +278,7 @@ def test_every_sheet_that_ships_gives_its_own_rates(name):
         share = min(corner_hz / evs.photoreceptor_cutoff_hz, 1)
         sigma = math.sqrt((beta.beta3**2 * level.lux + beta.beta4**2) * share) / (level.lux + beta.beta2)
         on, off = noise_rates_hz(
-            (evs.contrast_threshold_on, evs.contrast_threshold_off), evs.threshold_mismatch_std, sigma,
+            (evs.contrast_threshold_on, evs.contrast_threshold_off), evs.threshold_mismatch_rel, sigma,
             share * evs.photoreceptor_cutoff_hz, evs.refractory_period_us * 1e-6, sheet.leak_hz,
         )  # fmt: skip
         assert on + off + sheet.leak_hz == pytest.approx(level.rate_hz, rel=1e-3)

@@ -277,7 +277,7 @@ def log_level(flux):
 
 
 def davis(cols=4, rows=2):
-    return hr.load_sensor("davis346", {"evs.threshold_mismatch_std": 0}).crop(cols, rows)
+    return hr.load_sensor("davis346", {"evs.threshold_mismatch_rel": 0}).crop(cols, rows)
 
 
 def travel(levels, theta_on, theta_off):
@@ -312,7 +312,7 @@ def test_asynchronous_events_under_mains_flicker_are_the_analytic_number():
 
 @pytest.mark.parametrize("window_us", [1, 40])
 def test_every_edge_of_a_pulsed_light_is_followed(window_us):
-    changes = {"evs.threshold_mismatch_std": 0, "evs.window_us": window_us, "evs.contrast_threshold_off": 0.23}
+    changes = {"evs.threshold_mismatch_rel": 0, "evs.window_us": window_us, "evs.contrast_threshold_off": 0.23}
     sensor = hr.load_sensor("davis346", changes).crop(2, 2)
     flux = FlickerFlux([Pwm(500, 0.25, 0)], [Formula(1e6)], window_us)
     _, events = run(flux, sensor, 19_000)

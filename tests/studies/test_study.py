@@ -210,7 +210,7 @@ def test_event_figures_are_those_of_the_noise_model():
             # mismatch widens the thresholds: the noise model gives the same with its spread as noise
             x = 1e-3 * 0.16 * 10_000 / spec.window_us * grey + 5e-3
             s2 = (3.1e-5 * 0.16 * 10_000 / spec.window_us * grey) ** 2 + 2.116e-4**2
-            sigma = np.sqrt(2 * s2 / x**2 + (spec.threshold_mismatch_std * np.array([0.1981, 0.2019])) ** 2)
+            sigma = np.sqrt(2 * s2 / x**2 + (spec.threshold_mismatch_rel * np.array([0.1981, 0.2019])) ** 2)
             rate.append(
                 sum(0.5 * math.erfc(t / s / math.sqrt(2)) for t, s in zip((0.1981, 0.2019), sigma, strict=True))
                 / 1239e-6

@@ -59,7 +59,8 @@ class Pixels:
         return {
             ("threshold_by_counts", "ON"): on * harmonic, ("threshold_by_counts", "OFF"): off * harmonic,
             ("threshold", "ON"): on, ("threshold", "OFF"): off,
-            ("threshold_spread", "ON"): 100 * self.spread, ("threshold_spread", "OFF"): 100 * self.spread,
+            ("threshold_spread_percent", "ON"): 100 * self.spread,
+            ("threshold_spread_percent", "OFF"): 100 * self.spread,
             ("pixel_noise", "ON"): self.noise, ("pixel_noise", "OFF"): self.noise,
             ("contrast_sensitivity", "ON"): 100 * np.expm1(on), ("contrast_sensitivity", "OFF"): -100 * np.expm1(-off),
             ("latency", "ON"): self.latency_us, ("latency", "OFF"): self.latency_us,

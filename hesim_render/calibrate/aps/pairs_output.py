@@ -122,7 +122,7 @@ def content(result: PairCalibration) -> dict[str, Any]:
         "full_well_e": _full_well(result, k, relative),
         "dsnu_e": _dsnu(result, k, relative),
         "prnu_percent": _prnu(result),
-        "linearity_error": _linearity(result),
+        "linearity_error_percent": _linearity(result),
         "notes": [],
     }
 

@@ -104,7 +104,7 @@ def photon_transfer(
     if not good:
         reason = "lit variance does not rise with light enough (capture brighter frames at the dark exposures too)"
         names = ("K", "read_noise_e", "dark_current_e_per_s", "full_well_e", "dsnu_e", "prnu_percent")
-        return {name: not_identifiable(reason) for name in names} | {"linearity_error": linear}
+        return {name: not_identifiable(reason) for name in names} | {"linearity_error_percent": linear}
     value, error = np.array(list(good.values())).T
     weight = 1 / error**2
     k = float(weight @ value / weight.sum())
@@ -127,7 +127,7 @@ def photon_transfer(
         )
     result["dsnu_e"] = _dsnu(dark, k, relative)
     result["prnu_percent"] = _prnu(composite, dark, spec)
-    result["linearity_error"] = linear
+    result["linearity_error_percent"] = linear
     return result
 
 

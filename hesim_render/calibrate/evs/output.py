@@ -68,7 +68,7 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
         section["s_curve"] = {
             name: estimated(value, error, "events per trial", GROUPS) for name, (value, error) in vars(levels).items()
         }
-    section["threshold_mismatch"] = result.mismatch.described() | {
+    section["threshold_mismatch_rel"] = result.mismatch.described() | {
         "from": "static counts" if thresholds is None else "steps"
     }
     rho, leak = fit.values[4:]

@@ -129,7 +129,7 @@ def figures(
         entries.append({
             "file": Path(one.source).name, "lux": None if lux is None else lux[k], "seconds": one.seconds,
             "events": int(one.counts.sum()), "on_rate_hz": still.rate(rates, 0), "off_rate_hz": still.rate(rates, 1),
-            "on_rate_spread": still.rate_spread(one, 0), "off_rate_spread": still.rate_spread(one, 1),
+            "on_rate_spread_rel": still.rate_spread(one, 0), "off_rate_spread_rel": still.rate_spread(one, 1),
             "on_local_variation": still.regularity(one), "leak_rate_hz": leak,
         })  # fmt: skip
         if problem := still.not_still(one):

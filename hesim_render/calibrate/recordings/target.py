@@ -30,7 +30,7 @@ class TargetThresholds(NamedTuple):
 
     Parameters
     ----------
-    entries : ``theta_on``, ``theta_off`` (ln units) and ``threshold_mismatch``, as entries of the result.
+    entries : ``theta_on``, ``theta_off`` (ln units) and ``threshold_mismatch_rel``, as entries of the result.
     ratio : ρ = θ₋/θ₊, as an entry of the result.
     """
 
@@ -82,9 +82,9 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     }
     if fitted[2] > 2 * errors[2]:
         spread = float(np.sqrt(fitted[2]))
-        entries["threshold_mismatch"] = estimated(spread, errors[2] / (2 * spread), "relative std", GROUPS)
+        entries["threshold_mismatch_rel"] = estimated(spread, errors[2] / (2 * spread), "relative std", GROUPS)
     else:
-        entries["threshold_mismatch"] = {
+        entries["threshold_mismatch_rel"] = {
             "value": 0.0, "upper_limit": float(np.sqrt(max(fitted[2], 0.0) + 2 * errors[2])),
             "note": "the pixels scatter no more than the place of their turns makes them",
         }  # fmt: skip
@@ -97,7 +97,7 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
 def unknown(reason: str) -> TargetThresholds:
     """Figures of a target that tells none, with the reason."""
     entry = not_identifiable(reason)
-    return TargetThresholds(dict.fromkeys(("theta_on", "theta_off", "threshold_mismatch"), entry), entry)
+    return TargetThresholds(dict.fromkeys(("theta_on", "theta_off", "threshold_mismatch_rel"), entry), entry)
 
 
 def _moments(count: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -169,7 +169,7 @@ def _starts(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
 
 def _evs_rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
     names = {
-        "theta": "θ, mean of both", "theta_on": "θ₊", "theta_off": "θ₋", "threshold_mismatch": "threshold mismatch",
+        "theta": "θ, mean of both", "theta_on": "θ₊", "theta_off": "θ₋", "threshold_mismatch_rel": "threshold mismatch",
         "asymmetry": "asymmetry ρ = (θ₋ − θ₊)/(θ₋ + θ₊)", "leak_per_trial": "leak per trial",
         "leak_rate_hz": "leak",
     }  # fmt: skip

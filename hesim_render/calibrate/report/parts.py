@@ -15,7 +15,7 @@ HEAD = ("parameter", "value", "95 % interval", "unit, or why not")
 _FIRST = {
     "K": "system gain K", "quantum_efficiency": "quantum efficiency", "read_noise_e": "read noise", "dsnu_e": "DSNU",
     "prnu_percent": "PRNU", "theta_on": "threshold θ₊", "theta_off": "threshold θ₋",
-    "threshold_mismatch": "mismatch of the thresholds", "leak_per_trial": "leak per trial", "leak_rate_hz": "leak",
+    "threshold_mismatch_rel": "mismatch of the thresholds", "leak_per_trial": "leak per trial", "leak_rate_hz": "leak",
 }  # fmt: skip
 
 

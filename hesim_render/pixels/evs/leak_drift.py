@@ -46,8 +46,8 @@ class LeakDrift:
         index = layout.full_index.ravel()[layout.evs_pixel.ravel()]
         size = index.size
         relative = np.ones(size)
-        if spec.spread > 0:
-            relative += spec.spread * device_normal(noise.device_seed, Stream.LEAK_SPREAD, index)
+        if spec.spread_rel > 0:
+            relative += spec.spread_rel * device_normal(noise.device_seed, Stream.LEAK_SPREAD, index)
             relative = np.maximum(relative, LEAST_THRESHOLD_REL)
         tail_hz = np.zeros(size)
         if spec.tail_hz > 0:

@@ -159,7 +159,7 @@ class EvsNoise(PlainState):
         return Coefficients.of(beta, self.dn_per_electron, spec.shot_law, NUMPY)
 
     def _threshold_map(self, nominal: float, polarity: str, stream: Stream) -> Map:
-        spread = self.spec.threshold_mismatch_std
+        spread = self.spec.threshold_mismatch_rel
         if "mismatch" in self.off or spread == 0:
             return nominal
         relative: NDArray[np.floating] | None = relative_threshold(self.layout, polarity, spread)

@@ -105,7 +105,7 @@ def test_a_crop_is_the_full_sensor(name):
 
 @pytest.mark.parametrize("reference", ["previous_sample", "last_event"])
 def test_a_run_goes_on_where_another_one_stopped(reference):
-    changes = NOISE if reference == "previous_sample" else {"evs.threshold_mismatch_std": 0.02}
+    changes = NOISE if reference == "previous_sample" else {"evs.threshold_mismatch_rel": 0.02}
     is_tick = reference == "previous_sample"
     sensor = hr.load_sensor("reference-mono" if is_tick else "davis346", changes).crop(
         *((32, 24) if is_tick else (16, 12))

@@ -234,7 +234,7 @@ def rays_without(scene, sensor):
 
 def test_looks_that_halve_find_what_all_looks_find():
     """The same flux to the bit but at a few pairs, which are no farther off than noise, for fewer rays of the pilot."""
-    sensor = hr.load_sensor("davis346", {"evs.threshold_mismatch_std": 0.02}).crop(40, 24)
+    sensor = hr.load_sensor("davis346", {"evs.threshold_mismatch_rel": 0.02}).crop(40, 24)
     found = []
     for stride in (1, TUNING.look_stride):
         source = ChangeDrivenFlux(shadow_scene(), sensor, seed=4, tuning=replace(TUNING, look_stride=stride))
