@@ -13,7 +13,7 @@ import numpy as np
 
 import hesim_render as hr
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import TERMS, noise_models
+from hesim_render.capture.run_settings import TERMS, noise_models
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.windows import Windows

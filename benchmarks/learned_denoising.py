@@ -24,7 +24,7 @@ from learned_filter import LearnedFilter, area_under_curve, uniform_noise
 import hesim_render as hr
 from hesim_render.benchmark.event_filters import FILTERS
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.run_settings import noise_models
 from hesim_render.core import backend
 from hesim_render.pixels.evs.events import EventLabels, Label, no_events
 from hesim_render.sources.still import WindowByWindow

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.benchmark.event_filters import last_before
-from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import RangeError, SpecError, how_to_install
 from hesim_render.core.units import US_PER_S
 
 try:

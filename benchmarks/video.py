@@ -23,7 +23,7 @@ import numpy as np
 
 import hesim_render as hr
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.run_settings import noise_models
 from hesim_render.core import backend
 from hesim_render.sources.video import VideoFlux, VideoOptions
 

@@ -29,7 +29,7 @@ from hesim_render.benchmark.spans import (
 )
 from hesim_render.benchmark.statistics import figures
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.run_settings import noise_models
 from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.capture.simulate import simulate
 from hesim_render.core.guard import WholeFile, reading

@@ -10,8 +10,7 @@ from typing import Any
 from hesim_render.benchmark.plan import Clip
 from hesim_render.benchmark.spans import Span, Unit
 from hesim_render.benchmark.worker import attempt
-from hesim_render.core.errors import BackendError, OutputError, RangeError
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import BackendError, OutputError, RangeError, how_to_install
 
 _PATIENCE_S = 10
 

@@ -11,14 +11,14 @@ import numpy as np
 
 from hesim_render.benchmark.plan import BenchmarkPlan, Clip
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
 from hesim_render.capture.overheads import noise_seconds
+from hesim_render.capture.run_settings import noise_models
 from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.progress import Progress, in_words
 from hesim_render.mosaic.schedule import Exposure
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.demand import Demand
 from hesim_render.sources.render.light_level import in_absolute_light
+from hesim_render.sources.renderer import Demand
 from hesim_render.sources.scene import Scene, load_scene
 
 #: Clips that stand for all, at most; each takes some seconds.

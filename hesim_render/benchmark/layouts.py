@@ -22,8 +22,8 @@ from hesim_render.benchmark.pictures import ClipDevelopment
 from hesim_render.core.errors import OutputError, RangeError, did_you_mean
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress
+from hesim_render.recording.exports import write_tick_files
 from hesim_render.recording.frame import Frame
-from hesim_render.recording.tick_files import write_tick_files
 from hesim_render.spectral.transfer import encode_exactly
 
 _MARKER = "layout.txt"

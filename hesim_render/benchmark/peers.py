@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render import __version__
-from hesim_render.benchmark.event_times import quiet_rates, timing
-from hesim_render.benchmark.metrics import chamfer, count_error
+from hesim_render.benchmark.metrics import chamfer, count_error, quiet_rates, timing
 from hesim_render.benchmark.peer_pictures import exposures_us, pictures, write_pictures, write_settings
 from hesim_render.benchmark.peer_run import program_of, run_peer, version_of
 from hesim_render.benchmark.plan import chosen_sensor, file_of
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.run_settings import noise_models
 from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.core.guard import printable

@@ -140,7 +140,7 @@ class BenchmarkPlan:
         SpecError, RangeError
             If a sensor, a scene or a combination is not valid, or a given scene stands in two splits.
         """
-        from hesim_render.capture.noise_terms import noise_models
+        from hesim_render.capture.run_settings import noise_models
         from hesim_render.recording.truth_file import truth_kinds
 
         truth_kinds(self.spec.truth)

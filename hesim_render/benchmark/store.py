@@ -8,8 +8,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from hesim_render.core.errors import OutputError, SpecError
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import OutputError, SpecError, how_to_install
 from hesim_render.core.guard import inside
 from hesim_render.core.names import file_name, require_file_name
 from hesim_render.core.output import OutputFolder, output_errors

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.benchmark.folder import Benchmark, BenchmarkClip
-from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import RangeError, SpecError, how_to_install
 from hesim_render.events import voxel_grid
 from hesim_render.mosaic.description import Mosaic
 

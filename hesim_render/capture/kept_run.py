@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hesim_render.capture.loop import Capture
 from hesim_render.core.journal import Journal, key_of
-from hesim_render.core.plain_bytes import from_bytes, to_bytes
+from hesim_render.core.plain import from_bytes, to_bytes
 from hesim_render.core.progress import Progress
 from hesim_render.pixels.arrays import SavedState
 from hesim_render.recording.frame import Frame

@@ -14,9 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.capture.bench import Bench, set_up
+from hesim_render.capture.bench import Bench, set_up, truth_of
 from hesim_render.capture.lab_trials import TrialBench, TrialPlan, plan_trials
-from hesim_render.capture.lab_truth import truth_of
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError

@@ -35,8 +35,8 @@ from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.frame import Frame
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import with_crosstalk
-from hesim_render.sources.demand import Demand
 from hesim_render.sources.protocol import FluxSource, Sample
+from hesim_render.sources.renderer import Demand
 from hesim_render.sources.still import StillFlux
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.evs.photoreceptor import NODES_PER_CORNER_PERIOD
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.demand import Demand, Estimate
+from hesim_render.sources.renderer import Demand, Estimate
 
 # Processor time of one thread of an AVX-512 server (`time.process_time`), of runs of `rotating-star`, `fan` and
 # `colorchecker` on `eiger`, `davis346` and `imx636` at 64x48 px, and of event stages of 3,000 to 49,000 pixels.

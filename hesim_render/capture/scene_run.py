@@ -8,20 +8,19 @@ from functools import cached_property
 
 from hesim_render.capture.error_meter import stated_verdict
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import Noise
 from hesim_render.capture.overheads import with_overheads
-from hesim_render.capture.run_settings import RunSettings
+from hesim_render.capture.run_settings import Noise, RunSettings
 from hesim_render.core.errors import SpecError, TooLongError
 from hesim_render.core.progress import Progress
 from hesim_render.recording.truth_file import EVENTS
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.demand import Demand, Estimate
 from hesim_render.sources.render.audit.audit import STRETCHES, Audit
 from hesim_render.sources.render.audit.units import NotedFlux
 from hesim_render.sources.render.change_driven.flux import QUALITY
 from hesim_render.sources.render.renderer import SceneRenderer
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
+from hesim_render.sources.renderer import Demand, Estimate
 from hesim_render.sources.scene import Scene
 
 

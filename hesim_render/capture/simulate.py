@@ -7,22 +7,20 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Literal, Unpack
 
-from hesim_render.capture.noise_terms import TERMS, noise_models
-from hesim_render.capture.run_settings import RunOptions, RunSettings
+from hesim_render.capture.run_settings import TERMS, RunOptions, RunSettings, noise_models
 from hesim_render.capture.scene_renderer import camera_used, scene_renderer
 from hesim_render.capture.scene_run import SceneRun
 from hesim_render.core import backend
 from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress, expect, shown
 from hesim_render.mosaic.schedule import require_countable
-from hesim_render.recording.exposure import warn_of_exposure
-from hesim_render.recording.recording import Recording
+from hesim_render.recording.recording import Recording, warn_of_exposure
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.demand import Estimate
 from hesim_render.sources.render.framing import warn_if_unseen
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.renderer import SceneRenderer
+from hesim_render.sources.renderer import Estimate
 from hesim_render.sources.scene import Scene, scene_and_sensor
 from hesim_render.specs.lens import LENS_TERMS
 

@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Literal
 
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
-from hesim_render.capture.run_settings import require_seed, whole_us
+from hesim_render.capture.run_settings import noise_models, require_seed, whole_us
 from hesim_render.core import backend
 from hesim_render.core.progress import Progress, shown
 from hesim_render.mosaic.description import describe
 from hesim_render.mosaic.schedule import require_countable
-from hesim_render.recording.exposure import warn_of_exposure
-from hesim_render.recording.recording import Recording
+from hesim_render.recording.recording import Recording, warn_of_exposure
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor, as_sensor
 from hesim_render.sources.cube import CubeFlux, CubeOptions

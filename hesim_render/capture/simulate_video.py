@@ -12,8 +12,7 @@ import numpy as np
 
 from hesim_render.capture.kept_run import KeptRun
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
-from hesim_render.capture.run_settings import require_seed
+from hesim_render.capture.run_settings import noise_models, require_seed
 from hesim_render.capture.scene_run import require_short
 from hesim_render.core import backend
 from hesim_render.core.errors import RangeError, SpecError
@@ -22,8 +21,7 @@ from hesim_render.core.progress import Progress, expect, shown
 from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.mosaic.description import Mosaic, describe
 from hesim_render.mosaic.schedule import require_countable
-from hesim_render.recording.exposure import warn_of_exposure
-from hesim_render.recording.recording import Recording
+from hesim_render.recording.recording import Recording, warn_of_exposure
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor, as_sensor
 from hesim_render.sources.video import VideoFlux, VideoOptions

@@ -11,8 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from hesim_render.cli.exit_status import ExitStatus
-from hesim_render.cli.interrupts import Interrupts
+from hesim_render.cli.exit_status import ExitStatus, Interrupts
 from hesim_render.cli.options import in_options
 from hesim_render.cli.terminal import complain, silence_stdout
 from hesim_render.core.errors import HesimError, HesimWarning

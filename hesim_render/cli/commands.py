@@ -11,7 +11,6 @@ from hesim_render import __version__
 from hesim_render.cli import (
     benchmark,
     calibrate,
-    compare,
     cube,
     exchange,
     info,
@@ -48,7 +47,7 @@ def _app(
 
 
 for _command in (
-    simulate.simulate, view.view, view.isp, exchange.export, exchange.import_, measure.measure, compare.compare,
+    simulate.simulate, view.view, view.isp, exchange.export, exchange.import_, measure.measure, measure.compare,
     report.report, cube.cube, study.study, simulate.demo, info.info, new.new,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"))(_command)

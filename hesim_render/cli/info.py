@@ -153,7 +153,7 @@ def _rows_of(kind: Kind) -> list[dict[str, Any]]:
 
         return [{"name": name} for name in illuminant_names()]
     if kind is Kind.noise:
-        from hesim_render.capture.noise_terms import NOISE_TERMS
+        from hesim_render.capture.run_settings import NOISE_TERMS
 
         return [{"name": name} for name in NOISE_TERMS]
     if kind is Kind.lens:

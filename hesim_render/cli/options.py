@@ -33,7 +33,7 @@ def names_of(kind: str) -> Callable[[str], list[str]]:
 
 
 def _noise_terms(incomplete: str) -> list[str]:
-    from hesim_render.capture.noise_terms import TERMS
+    from hesim_render.capture.run_settings import TERMS
 
     return [name for name in TERMS if name.startswith(incomplete)]
 

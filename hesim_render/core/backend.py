@@ -30,8 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from hesim_render.core.child import child_environment, interrupts_held, python_command
-from hesim_render.core.errors import BackendError
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import BackendError, how_to_install
 
 OLDEST_LLVM = 17
 BACKEND_VARIABLE = "HESIM_RENDER_BACKEND"  # "llvm" or "cuda" forces one

@@ -6,7 +6,9 @@ Any other exception that escapes is a bug of this package and keeps its tracebac
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
+from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 
@@ -108,3 +110,22 @@ class BackendError(HesimError, RuntimeError):
 
 class OutputError(HesimError, OSError):
     """A result could not be written. No partial output is left behind."""
+
+
+def how_to_install(extra: str) -> str:
+    """The command that installs the packages of an extra, by their own names: this works without a release as well.
+
+    Parameters
+    ----------
+    extra : name of the extra in ``pyproject.toml``.
+    """
+    try:
+        stated = requires("hesim_render") or []
+    except PackageNotFoundError:  # run from a source tree that was never installed
+        stated = []
+    own = re.compile(rf"""extra\s*==\s*["']{re.escape(extra)}["']""")
+    result = [line.partition(";")[0].strip() for line in stated if own.search(line)]
+    packages = [re.sub(r"^([\w.-]+(?:\[[^\]]*\])?)\s*\(?([^)]*)\)?$", r"\1\2", text) for text in result] or [
+        f".[{extra}]"
+    ]
+    return "pip install " + " ".join(f"'{name}'" for name in packages)

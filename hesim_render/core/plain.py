@@ -1,11 +1,19 @@
-"""Plain values: dataclasses without their cached values, and content of JSON files."""
+"""Plain values: dataclasses without their cached values, content of JSON files, and bytes.
+
+Plain values, NumPy arrays and types of Dr.Jit arrays become bytes and come back; nothing in the bytes is ever executed.
+"""
 
 from __future__ import annotations
 
+import json
+import struct
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.backend import jit
 
 
 class PlainState:
@@ -28,3 +36,84 @@ def finite(node: Any) -> Any:
     if isinstance(node, float):
         return node if np.isfinite(node) else None
     return node
+
+
+#: Length of the JSON text that comes first; the data of the arrays follow it in order.
+_LENGTH = struct.Struct("<Q")
+
+
+def to_bytes(value: Any) -> bytes:
+    """Bytes of a value: None, truth values, numbers, text, types of Dr.Jit arrays, NumPy arrays and scalars, and tuples
+    and dictionaries of these.
+
+    Parameters
+    ----------
+    value : the value; keys of dictionaries are text.
+
+    Raises
+    ------
+    TypeError
+        If there is something else in it.
+    """
+    arrays: list[NDArray] = []
+    text = json.dumps(_outline(value, arrays)).encode()
+    return b"".join([_LENGTH.pack(len(text)), text, *(array.tobytes() for array in arrays)])
+
+
+def from_bytes(data: bytes) -> Any:
+    """The value that `to_bytes` was given; its arrays may be written to.
+
+    Parameters
+    ----------
+    data : from `to_bytes`.
+    """
+    (length,) = _LENGTH.unpack_from(data)
+    begin = _LENGTH.size + length
+    value, _ = _filled(json.loads(data[_LENGTH.size : begin]), data, begin)
+    return value
+
+
+def _outline(value: Any, arrays: list[NDArray]) -> Any:
+    """The value with an object of one key in place of each part that JSON does not tell apart."""
+    if isinstance(value, np.ndarray | np.generic):  # first, as a float64 of NumPy is a float of Python as well
+        if value.dtype.hasobject:
+            raise TypeError("no plain value: an array of objects")
+        arrays.append(np.asarray(value))
+        kind = np.lib.format.dtype_to_descr(value.dtype)
+        return {"array": [kind, list(value.shape), isinstance(value, np.generic)]}
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, type):
+        return {"type": value.__name__}
+    if isinstance(value, tuple):
+        return {"tuple": [_outline(entry, arrays) for entry in value]}
+    if isinstance(value, dict):
+        return {"dict": [[key, _outline(entry, arrays)] for key, entry in value.items()]}
+    raise TypeError(f"no plain value: {type(value).__name__}")
+
+
+def _filled(outline: Any, data: bytes, begin: int) -> tuple[Any, int]:
+    """The value of an outline, and the end of its data."""
+    import drjit as dr
+
+    if not isinstance(outline, dict):
+        return outline, begin
+    ((kind, given),) = outline.items()
+    if kind == "type":
+        result = getattr(jit(), given, None)
+        if not dr.is_array_v(result):  # the bytes may name anything
+            raise TypeError(f"no type of Dr.Jit arrays: {given!r}")
+        return result, begin
+    if kind == "array":
+        descr, shape, is_scalar = given
+        dtype = np.dtype(descr if isinstance(descr, str) else [tuple(field) for field in descr])
+        count = int(np.prod(shape, dtype=np.int64))
+        array = np.frombuffer(data, dtype, count, begin).reshape(shape).copy()
+        return (array[()] if is_scalar else array), begin + array.nbytes
+    entries = []
+    for entry in given if kind == "tuple" else [entry for _, entry in given]:
+        result, begin = _filled(entry, data, begin)
+        entries.append(result)
+    if kind == "tuple":
+        return tuple(entries), begin
+    return dict(zip([key for key, _ in given], entries, strict=True)), begin

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.core.device_types import NUMPY
 from hesim_render.core.errors import RangeError
-from hesim_render.core.namespace import NUMPY
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.evs import formulas
 from hesim_render.pixels.evs.formulas import POLE_HZ

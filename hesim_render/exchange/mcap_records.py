@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from hesim_render.core.errors import SpecError
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import SpecError, how_to_install
 from hesim_render.core.guard import reading
 
 #: Most bytes that a compressed part of a file may unpack to. Writers make parts of 1 to 16 MB.

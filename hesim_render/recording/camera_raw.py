@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.errors import HesimWarning, SpecError
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import HesimWarning, SpecError, how_to_install
 from hesim_render.core.guard import printable, reading, require_memory, require_picture, require_plain
 from hesim_render.core.npz import read_array, read_arrays
 from hesim_render.recording.dng import read_dng

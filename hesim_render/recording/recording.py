@@ -5,11 +5,19 @@ The content is in `recorded`. Each method here calls a function over it, which i
 
 from __future__ import annotations
 
+import contextlib
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hesim_render.core.errors import RangeError
+import numpy as np
+
+from hesim_render.core.errors import HesimWarning, RangeError, SpecError
+from hesim_render.core.guard import inside
+from hesim_render.recording.folder import FolderWriter
+from hesim_render.recording.label_file import OBJECT_FILE
 from hesim_render.recording.recorded import Recorded
+from hesim_render.recording.truth_file import TRUTH_FILE, TruthRequest, write_truth
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -78,7 +86,6 @@ class Recording(Recorded):
         OutputError
             If the folder exists (and `overwrite` is not set) or cannot be written.
         """
-        from hesim_render.recording.save import save
 
         return save(self, path, overwrite)
 
@@ -127,3 +134,71 @@ def as_recording(given: Recording | str | Path) -> Recording:
     if not isinstance(given, Recording):
         raise RangeError("recording", given, "a recording, or the path of its folder")
     return given
+
+
+def save(recording: Recorded, path: str | Path, overwrite: bool = False) -> Path:
+    """Write a recording as a folder; see `Recording.save`."""
+    with FolderWriter(path, recording.manifest, overwrite) as writer:
+        for frame in recording.frames:
+            writer.add_frame(frame)
+        writer.add_events(recording.events)
+        if recording.event_truth is not None:
+            writer.set_event_truth(recording.event_truth)
+        writer.set_events_dropped(recording.manifest["counts"].get("events_dropped", 0))
+        if recording.event_labels is not None:
+            writer.add_event_labels(recording.event_labels.as_block())
+        _save_truth(recording, writer)
+        return writer.finish()
+
+
+def _save_truth(recording: Recorded, writer: FolderWriter) -> None:
+    """Write the geometric truth that the run was asked for; a copy of a file, or computed again."""
+    if recording.path is not None:
+        if recording.has_event_objects:
+            writer.copy_in(inside(recording.path, OBJECT_FILE), OBJECT_FILE)
+        if (recording.path / TRUTH_FILE).is_file():
+            writer.copy_in(inside(recording.path, TRUTH_FILE), TRUTH_FILE)
+        return
+    request = TruthRequest.of(recording.manifest)
+    if recording.event_labels is not None and recording.scene is not None:
+        with contextlib.suppress(SpecError):  # of a scene without geometric truth
+            writer.set_event_objects(recording.truth.objects_at)
+    if request.geometry:
+        writer.write_in(TRUTH_FILE, lambda path: write_truth(path, recording.truth, request))
+
+
+#: Share of the pixels of a frame that is judged as dark where its signal is below the read noise.
+_DARK_SHARE = 0.99
+
+
+#: Share of saturated pixels that gives a warning.
+_WHITE_SHARE = 0.5
+
+
+def warn_of_exposure(recording: Recording) -> Recording:
+    """The recording; warns, by its middle frame, if nearly all signal is below the read noise, or most is saturated.
+
+    A scene without light is dark by intent, which gives no warning.
+    """
+    if not len(recording.frames):
+        return recording
+    frame, aps = recording.frames[len(recording.frames) // 2], recording.manifest["sensor"]["spec"]["aps"]
+    signal_e = frame.electrons_mean[frame.valid]
+    if signal_e.size == 0:
+        return recording
+    typical_e = float(np.quantile(signal_e, _DARK_SHARE))
+    white = float(np.mean(frame.raw[frame.valid] >= recording.mosaic.white_level_dn))
+    where = f"frame {frame.index}, exposed for {frame.exposure_us} µs"
+    if signal_e.max() > 0 and typical_e < aps["read_noise_e"]:
+        warnings.warn(
+            f"{where}, is nearly dark: {100 * _DARK_SHARE:g} % of its pixels have fewer than {typical_e:.2g} e⁻, at a "
+            f"read noise of {aps['read_noise_e']:g} e⁻; give more light or a longer exposure",
+            HesimWarning, stacklevel=3,
+        )  # fmt: skip
+    elif white > _WHITE_SHARE:
+        warnings.warn(
+            f"{where}, is overexposed: {100 * white:.0f} % of its pixels are saturated; give less light or a shorter "
+            "exposure",
+            HesimWarning, stacklevel=3,
+        )  # fmt: skip
+    return recording

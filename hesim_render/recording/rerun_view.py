@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.errors import SpecError
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import SpecError, how_to_install
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.colour_view import OFF_COLOUR, ON_COLOUR, colour_picture

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import RangeError
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import mixed
-from hesim_render.spectral.colour_difference import delta_e_2000, lab
+from hesim_render.spectral.colorimetry import delta_e_2000, lab
 from hesim_render.studies.colour_noise import YSNR_WEIGHTS
 from hesim_render.studies.colour_samples import ColourSamples
 

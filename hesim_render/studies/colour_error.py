@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.spectral.colorimetry import xyz_to_linear_srgb
-from hesim_render.spectral.colour_difference import delta_e_2000, delta_e_ab, lab
+from hesim_render.spectral.colorimetry import delta_e_2000, delta_e_ab, lab, xyz_to_linear_srgb
 from hesim_render.studies.colour_noise import ChannelNoise
 from hesim_render.studies.colour_samples import ColourSamples
 from hesim_render.studies.subspace import rank

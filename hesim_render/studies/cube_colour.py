@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import device_namespace
 from hesim_render.core.errors import SpecError
-from hesim_render.core.namespace import device_namespace
 from hesim_render.core.tables import table
 from hesim_render.sources.cube.planes import blocks, integration_weights
 from hesim_render.sources.render.cube import render_cube
 from hesim_render.sources.scene import load_scene
 from hesim_render.specs.study import NamedLight, SurfacesSpec
-from hesim_render.spectral.colour_difference import Triple, delta_e_2000_of, lab_of
+from hesim_render.spectral.colorimetry import Triple, delta_e_2000_of, lab_of
 from hesim_render.spectral.spectrum import Spectrum, colour_matching_functions, product
 from hesim_render.studies.table import Cell
 from hesim_render.targets.cube_file import CubeFile, open_cube

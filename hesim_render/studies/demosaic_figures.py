@@ -19,7 +19,7 @@ from hesim_render.mosaic.colour_profile import Camera
 from hesim_render.mosaic.description import describe
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import mixed
-from hesim_render.spectral.colour_difference import lab
+from hesim_render.spectral.colorimetry import lab
 from hesim_render.spectral.spectrum import Spectrum
 from hesim_render.studies.chart_noise import Measured
 from hesim_render.studies.table import Cell

@@ -24,7 +24,7 @@ from hesim_render.core.device_types import Float64
 from hesim_render.core.tables import table
 from hesim_render.sensor.photocurrent import photocurrent
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.spectral.colour_difference import lab
+from hesim_render.spectral.colorimetry import lab
 from hesim_render.spectral.spectrum import Spectrum, scale_to_lux
 from hesim_render.studies.colour_noise import GREY, ChannelNoise
 from hesim_render.studies.colour_samples import colour_samples

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.errors import SpecError, did_you_mean
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import SpecError, did_you_mean, how_to_install
 from hesim_render.specs.boards import (
     AprilGridTarget,
     CharucoTarget,

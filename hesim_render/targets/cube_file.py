@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.errors import SpecError
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import SpecError, how_to_install
 from hesim_render.core.guard import MOST_TEXT_BYTES, WholeFile, reading, require_memory
 from hesim_render.targets.matlab_cube import read_hdf5, read_matlab
 from hesim_render.targets.opened_cube import CubeFile, Rows, known_bands

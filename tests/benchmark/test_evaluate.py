@@ -9,11 +9,10 @@ from PIL import Image
 
 from benchmarks import small
 from hesim_render.benchmark import Benchmark, build_benchmark, evaluate_benchmark
-from hesim_render.benchmark.evaluate import summary, table
+from hesim_render.benchmark.evaluate import NOTHING, summary, table, verdicts
 from hesim_render.benchmark.pictures import ClipDevelopment
 from hesim_render.benchmark.predictions import Predictions
 from hesim_render.benchmark.tasks import ClipTasks, Score
-from hesim_render.benchmark.verdict import NOTHING, verdicts
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.pixels.evs.events import Label
 from hesim_render.specs.files import data_folder

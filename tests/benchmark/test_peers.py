@@ -10,7 +10,7 @@ import pytest
 import hesim_render as hr
 from hesim_render import cli
 from hesim_render.benchmark import peers
-from hesim_render.benchmark.event_times import nearest_us, quiet_rates, timing
+from hesim_render.benchmark.metrics import nearest_us, quiet_rates, timing
 from hesim_render.benchmark.peer_pictures import encoded, exposures_us, pictures
 from hesim_render.benchmark.peer_run import PeerError, read_events, run_peer, version_of
 from hesim_render.benchmark.peers import compare_peers, peers_table

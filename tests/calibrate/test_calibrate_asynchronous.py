@@ -15,7 +15,7 @@ import hesim_render as hr
 from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
 from hesim_render.calibrate.asynchronous import checks, defects
 from hesim_render.calibrate.asynchronous.defects import classify, plainly_bad
-from hesim_render.calibrate.asynchronous.first_event import first_event
+from hesim_render.calibrate.asynchronous.likelihood import first_event
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials, read_trials
 from hesim_render.calibration.spec import Defect
 from hesim_render.capture.lab import write_captures

@@ -17,7 +17,7 @@ from hesim_render.calibrate.evs.model import probability_variance
 from hesim_render.calibrate.evs.steps import GROUPS, Steps, pixel_groups
 from hesim_render.calibrate.evs.thresholds import fit_thresholds
 from hesim_render.capture.lab import write_captures
-from hesim_render.core.namespace import NUMPY
+from hesim_render.core.device_types import NUMPY
 from hesim_render.pixels.evs.formulas import exceedance, over_thresholds
 from hesim_render.recording.capture_set import read_captures
 

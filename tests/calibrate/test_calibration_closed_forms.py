@@ -19,7 +19,7 @@ from hesim_render.calibrate.aps.composite import Composite, signal_at_event_pixe
 from hesim_render.calibrate.aps.dark import fit_dark
 from hesim_render.calibrate.aps.photon_transfer import _read_noise, linearity, system_gain
 from hesim_render.calibrate.aps.variance import Pooled, fit_variance, join, pool
-from hesim_render.calibrate.asynchronous.first_event import correlation
+from hesim_render.calibrate.asynchronous.likelihood import correlation
 from hesim_render.calibrate.estimate import Spread, estimated
 from hesim_render.calibrate.evs import checks as event_checks
 from hesim_render.calibrate.evs import counts, dispersion
@@ -27,8 +27,8 @@ from hesim_render.calibrate.evs import fitted as fitted_events
 from hesim_render.calibrate.evs import goodness as event_goodness
 from hesim_render.calibrate.evs.analysis import _with_conversion_error, step_in_ln
 from hesim_render.calibrate.evs.cells import PixelThresholds, pool_events
+from hesim_render.calibrate.evs.checks import curve_levels
 from hesim_render.calibrate.evs.counts import StaticCapture
-from hesim_render.calibrate.evs.curve_levels import curve_levels
 from hesim_render.calibrate.evs.defects import bad_event_pixels, bad_in_steps
 from hesim_render.calibrate.evs.fitted import fit_events
 from hesim_render.calibrate.evs.medians import middle_and_spread

@@ -5,7 +5,7 @@ import pytest
 
 import hesim_render as hr
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
 from hesim_render.mosaic.schedule import exposures, tick_blocks

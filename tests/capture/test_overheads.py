@@ -7,7 +7,7 @@ import hesim_render as hr
 from hesim_render.capture import overheads
 from hesim_render.capture.overheads import noise_seconds, with_overheads
 from hesim_render.mosaic.schedule import Block, BlockSample, Exposure
-from hesim_render.sources.demand import Demand, Estimate
+from hesim_render.sources.renderer import Demand, Estimate
 
 RAYS = Estimate(seconds=3.0, peak_bytes=7e8, rays=6e6)
 RUN = {"windows": 130.0, "frames": 0, "audited": False, "rests": False}

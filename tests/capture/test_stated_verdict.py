@@ -8,7 +8,7 @@ from hesim_render.capture.event_flux import EventFlux
 from hesim_render.capture.scene_run import require_short
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import TooLongError
-from hesim_render.sources.demand import Estimate
+from hesim_render.sources.renderer import Estimate
 
 
 def meter(scatter, outliers=0.0, count=20_000, seed=3):

@@ -15,12 +15,11 @@ import recordings
 
 import hesim_render as hr
 from hesim_render import cli
-from hesim_render.capture.noise_terms import NOISE_TERMS
+from hesim_render.capture.run_settings import NOISE_TERMS
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.core import backend, progress
 from hesim_render.core.backend import BackendCandidate
-from hesim_render.core.errors import RangeError
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import RangeError, how_to_install
 from hesim_render.core.region import parse_roi
 from hesim_render.core.shipped import data_folder, list_names
 

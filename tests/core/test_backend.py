@@ -8,8 +8,7 @@ import pytest
 
 from hesim_render.core import backend
 from hesim_render.core.backend import BackendCandidate
-from hesim_render.core.errors import BackendError
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import BackendError, how_to_install
 
 
 @pytest.fixture

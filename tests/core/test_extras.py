@@ -4,7 +4,7 @@ import re
 import tomllib
 from pathlib import Path
 
-from hesim_render.core import extras
+from hesim_render.core import errors
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -13,12 +13,12 @@ def test_an_extra_is_advised_by_the_names_of_its_packages(monkeypatch):
     lines = ["numpy>=2.1", "mcap >=1.2 ; extra == 'ros'", 'trimesh>=4.5; extra == "meshes"',
              "networkx (>=3) ; extra == 'meshes'",
              "colour-science[plotting]>=0.4; python_version < '4' and extra == 'ros-more'"]  # fmt: skip
-    monkeypatch.setattr(extras, "requires", lambda name: lines)
-    assert extras.how_to_install("meshes") == "pip install 'trimesh>=4.5' 'networkx>=3'"
-    assert extras.how_to_install("ros") == "pip install 'mcap>=1.2'"
-    assert extras.how_to_install("ros-more") == "pip install 'colour-science[plotting]>=0.4'"
-    monkeypatch.setattr(extras, "requires", lambda name: None)
-    assert extras.how_to_install("ros") == "pip install '.[ros]'"
+    monkeypatch.setattr(errors, "requires", lambda name: lines)
+    assert errors.how_to_install("meshes") == "pip install 'trimesh>=4.5' 'networkx>=3'"
+    assert errors.how_to_install("ros") == "pip install 'mcap>=1.2'"
+    assert errors.how_to_install("ros-more") == "pip install 'colour-science[plotting]>=0.4'"
+    monkeypatch.setattr(errors, "requires", lambda name: None)
+    assert errors.how_to_install("ros") == "pip install '.[ros]'"
 
 
 def test_no_advice_names_a_release_that_does_not_exist():

@@ -9,8 +9,7 @@ import time
 
 import pytest
 
-from hesim_render.cli.exit_status import ExitStatus
-from hesim_render.cli.interrupts import Interrupts
+from hesim_render.cli.exit_status import ExitStatus, Interrupts
 from hesim_render.core.child import interrupts_held
 
 #: A lock that is taken twice: native code that never comes back, and that no signal wakes.

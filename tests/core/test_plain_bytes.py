@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hesim_render.core.backend import jit
-from hesim_render.core.plain_bytes import from_bytes, to_bytes
+from hesim_render.core.plain import from_bytes, to_bytes
 
 EVENTS = np.array([(2**40, 3, 4, -1)], np.dtype([("t_us", "i8"), ("x", "u2"), ("y", "u2"), ("polarity", "i1")]))
 VALUES = [

@@ -158,7 +158,7 @@ def test_a_class_has_a_name_of_its_own():
 def test_formulas_draw_nothing_and_need_no_device(kind):
     """They stand on the array namespace alone: no generator, no backend, no sampler."""
     used = modules_imported(f"hesim_render.pixels.{kind}.formulas")
-    assert used == {"hesim_render.core.device_types", "hesim_render.core.namespace"}
+    assert used == {"hesim_render.core.device_types"}
 
 
 #: What keeps the state of any object, and loop states that hold values of several kinds.
@@ -195,7 +195,7 @@ def test_the_content_of_a_recording_does_not_know_its_pictures():
             reached.add(name)
             waiting += modules_imported(name)
     assert "hesim_render.recording.frame" in reached
-    drawn = {"preview", "showcase", "page", "plots", "movie", "exports", "save"}
+    drawn = {"preview", "showcase", "page", "plots", "movie", "exports"}
     assert not reached & {f"hesim_render.recording.{name}" for name in drawn}
 
 

@@ -10,7 +10,7 @@ from scipy import integrate, optimize, stats
 
 import hesim_render as hr
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.layout import Layout
@@ -18,8 +18,7 @@ from hesim_render.pixels.evs import photoreceptor
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.pixels.evs.model import EVS_TERMS, EvsNoise
 from hesim_render.pixels.evs.processes import BandNoise
-from hesim_render.pixels.evs.readout import EventReadout, scan_start_row
-from hesim_render.pixels.evs.stage import EvsStage
+from hesim_render.pixels.evs.stage import EventReadout, EvsStage, scan_start_row
 from hesim_render.recording.recording import Recording
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.reading import read_sensor

@@ -15,7 +15,7 @@ from scipy import stats
 
 from hesim_render.calibrate import read_calibration
 from hesim_render.core.backend import jit
-from hesim_render.core.namespace import NUMPY, device_namespace
+from hesim_render.core.device_types import NUMPY, device_namespace
 from hesim_render.pixels.aps import formulas as aps
 from hesim_render.pixels.evs import formulas as evs
 
@@ -165,7 +165,7 @@ import json, sys
 sys.modules["drjit"] = sys.modules["mitsuba"] = None
 import numpy as np
 from hesim_render.calibrate import calibrate_aps, calibrate_evs
-from hesim_render.core.namespace import NUMPY
+from hesim_render.core.device_types import NUMPY
 from hesim_render.pixels.aps import formulas as aps
 from hesim_render.pixels.evs import formulas as evs
 folder, out, beta, event_beta, electrons = sys.argv[1], sys.argv[2], *map(json.loads, sys.argv[3:])

@@ -248,7 +248,7 @@ def test_it_can_be_switched_off_and_poisson_is_as_before():
 
 
 def test_the_mean_rate_is_that_of_its_law():
-    leak = LeakSpec(process="drift", rate_hz=0.7, rate_hz_per_dn=0.02, spread=0.2, tail_hz=0.9)
+    leak = LeakSpec(process="drift", rate_hz=0.7, rate_hz_per_dn=0.02, spread_rel=0.2, tail_hz=0.9)
     u = (np.arange(2_000_000) + 0.5) / 2_000_000 * 1000 / 1000.9
     assert leak.mean_rate_hz(11.0) == pytest.approx(0.7 + 0.22 + np.mean(0.9 * u / (1 - u)), rel=1e-3)
 

@@ -12,7 +12,7 @@ from hesim_render.calibrate.flicker import dynamics, unsteady
 from hesim_render.calibrate.moments import FrameMoments
 from hesim_render.calibrate.summary import summary_lines
 from hesim_render.capture.lab import write_captures
-from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.core.rng import Stream

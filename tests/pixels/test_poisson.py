@@ -8,9 +8,8 @@ import pytest
 from scipy import special, stats
 
 from hesim_render.core.backend import jit
-from hesim_render.core.rng import Stream, philox
+from hesim_render.core.rng import Stream, normal_pair, philox
 from hesim_render.pixels.aps.poisson import _log_probability, poisson
-from hesim_render.pixels.normal import normal_pair
 
 MEANS = (0.02, 0.7, 3.0, 9.99, 10.0, 10.3, 37.0, 500.0, 5000.0, 1e5, 1e6)
 # 33 comparisons (χ², mean, variance at 11 means) at 1e-7 each: a false alarm in 300,000 runs

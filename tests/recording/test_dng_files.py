@@ -15,7 +15,7 @@ from hesim_render.core.errors import HesimWarning, SpecError
 from hesim_render.recording.dng import noise_profile, write_dng
 from hesim_render.recording.imports import import_recording
 from hesim_render.recording.outline import scene_name
-from hesim_render.recording.preview_dng import needs_preview, write_preview_dng
+from hesim_render.recording.showcase import needs_preview, write_preview_dng
 
 NOISE = 51041
 

@@ -21,8 +21,8 @@ from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.mosaic.description import describe
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.recording import manifest as manifests
-from hesim_render.recording.preview_dng import binned
 from hesim_render.recording.recording import Recording
+from hesim_render.recording.showcase import binned
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.specs import SensorSpec, read_scene
 

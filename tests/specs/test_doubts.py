@@ -6,7 +6,7 @@ import pytest
 import recordings
 
 from hesim_render.core.errors import HesimWarning, SpecError, closest
-from hesim_render.recording.exposure import warn_of_exposure
+from hesim_render.recording.recording import warn_of_exposure
 from hesim_render.sensor.reading import read_sensor
 from hesim_render.specs import read_scene
 from hesim_render.specs.files import data_folder, list_names

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from hesim_render.core.backend import jit
-from hesim_render.core.namespace import device_namespace
-from hesim_render.spectral.colour_difference import delta_e_2000, delta_e_2000_of, delta_e_ab, lab, lab_of
+from hesim_render.core.device_types import device_namespace
+from hesim_render.spectral.colorimetry import delta_e_2000, delta_e_2000_of, delta_e_ab, lab, lab_of
 
 #: Pairs of [sharma2005] at which implementations differ: hues on both sides of 0°, greys, the turn at 275°.
 PAIRS = np.array([

@@ -17,7 +17,7 @@ from hesim_render.specs.files import list_names
 from hesim_render.specs.filter_set import read_filter_set
 from hesim_render.specs.run import StudyKind, study_kind
 from hesim_render.spectral import spectrum as spectra
-from hesim_render.spectral.colour_difference import delta_e_2000, lab
+from hesim_render.spectral.colorimetry import delta_e_2000, lab
 from hesim_render.spectral.physical import dye_transmittance, silicon_index, thin_film_transmittance
 from hesim_render.studies import ChannelNoise, Table, reflectance_set
 from hesim_render.studies.colour_samples import colour_samples

@@ -15,7 +15,7 @@ from scipy.stats import norm
 
 from hesim_render.calibrate.aps.common_mode import FrameDrift, Shared, frame_drift
 from hesim_render.calibrate.aps.fitted import ApsCalibration
-from hesim_render.calibrate.finding import ALARM, Finding
+from hesim_render.calibrate.estimate import ALARM, Finding
 from hesim_render.calibrate.moments import FrameMoments
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, polynomial
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as f_law
 
-from hesim_render.calibrate.finding import ALARM
+from hesim_render.calibrate.estimate import ALARM
 from hesim_render.calibrate.moments import FrameMoments
 
 #: Least fraction of a row that is not clipped for which the row's own sample of its noise is used.

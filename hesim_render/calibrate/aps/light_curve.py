@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_law
 from scipy.stats import f as f_law
 
-from hesim_render.calibrate.finding import ALARM
+from hesim_render.calibrate.estimate import ALARM
 
 #: Gauss–Newton steps of a fit that is nearly linear.
 _STEPS = 4

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import gamma, norm
 
-from hesim_render.calibrate.finding import ALARM
+from hesim_render.calibrate.estimate import ALARM
 from hesim_render.calibrate.moments import Frames
 
 #: Most lines that a sensor file keeps, the strongest ones.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hesim_render.calibrate.aps.pairs import PairCalibration
-from hesim_render.calibrate.finding import ALARM, Finding
+from hesim_render.calibrate.estimate import ALARM, Finding
 
 #: Relative changes of signal and variance from which a finding names them.
 _LEAST_BEND, _LEAST_SCATTER = 2e-3, 2e-3

@@ -14,8 +14,7 @@ from hesim_render.calibrate.asynchronous.defects import TrialDefects, classify, 
 from hesim_render.calibrate.asynchronous.fit import MOST_PIXELS, Fit, fit_trials, rough_start
 from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, NAMES, THETA, Law, TrialCounts, log_prior
 from hesim_render.calibrate.asynchronous.trials import Trials, read_trials
-from hesim_render.calibrate.estimate import Spread
-from hesim_render.calibrate.finding import Finding
+from hesim_render.calibrate.estimate import Finding, Spread
 from hesim_render.core.errors import SpecError
 from hesim_render.recording.capture_set import CaptureSet
 

@@ -17,7 +17,7 @@ from scipy.stats import norm, poisson
 from hesim_render.calibrate.asynchronous.fit import Fit, middle_and_spread, pixel_thresholds
 from hesim_render.calibrate.asynchronous.likelihood import LEAK, MISMATCH, THETA, chances, log_prior, step_of
 from hesim_render.calibrate.asynchronous.trials import Trials
-from hesim_render.calibrate.finding import ALARM, Finding
+from hesim_render.calibrate.estimate import ALARM, Finding
 
 #: Least number of events, and of trials without one, in a tested column; and number of pixels per column.
 _FEWEST, _PIXELS_PER_COLUMN = 25.0, 10

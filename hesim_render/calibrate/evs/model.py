@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from hesim_render.calibrate.evs.cells import Cells
-from hesim_render.core.namespace import NUMPY
+from hesim_render.core.device_types import NUMPY
 from hesim_render.pixels.evs.formulas import (
     Coefficients,
     ShotLaw,

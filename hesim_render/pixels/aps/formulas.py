@@ -16,7 +16,7 @@ Gaussian number per row of a frame, shared by the pixels of the row (temporal ro
 f is the identity, or a smooth curve (`Curve`). The ADC rounds once: no uniform noise
 is added, and every variance here excludes its q²/12.
 
-Arrays are NumPy's or Dr.Jit's (`hesim_render.core.namespace`); nothing here draws a random number.
+Arrays are NumPy's or Dr.Jit's (`hesim_render.core.device_types`); nothing here draws a random number.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.core.device_types import Values
-from hesim_render.core.namespace import Namespace
+from hesim_render.core.device_types import Namespace, Values
 
 #: Error variance of rounding with a step of q = 1 DN, q²/12.
 ADC_VARIANCE_DN2 = 1.0 / 12.0

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
-from hesim_render.core.device_types import Float, UInt32, Values
+from hesim_render.core.device_types import NUMPY, Float, Namespace, UInt32, Values
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.core.namespace import NUMPY, Namespace
 from hesim_render.core.plain import PlainState
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout

@@ -10,16 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
-from hesim_render.core.device_types import Float, Generator, UInt32
-from hesim_render.core.namespace import device_namespace
-from hesim_render.core.rng import Stream, philox
+from hesim_render.core.device_types import Float, Generator, UInt32, device_namespace
+from hesim_render.core.rng import Stream, normal_pair, philox
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps.fixed_pattern import FixedPattern
 from hesim_render.pixels.aps.formulas import PixelProperties
 from hesim_render.pixels.aps.poisson import poisson
 from hesim_render.pixels.arrays import take, to_device
-from hesim_render.pixels.normal import normal_pair
 from hesim_render.specs.frame_pixels import InterferenceSpec
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
-from hesim_render.core.rng import Stream, philox
+from hesim_render.core.rng import Stream, normal_pair, philox
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.arrays import take
 from hesim_render.pixels.evs.defects import DefectEvents
@@ -21,7 +21,6 @@ from hesim_render.pixels.evs.photoreceptor import Photoreceptor
 from hesim_render.pixels.evs.processes import BandNoise, LeakProcess
 from hesim_render.pixels.evs.refractory import LONG_AGO_US, Refractory
 from hesim_render.pixels.evs.start import start_chances, start_of
-from hesim_render.pixels.normal import normal_pair
 
 #: Periods of the noise in still light before the first sample, in which noise and level of comparison become those of
 #: one another.

@@ -11,7 +11,7 @@ With I the signal in DN of the signal reference, per event position::
 θ are natural-log thresholds; the threshold of a pixel is θ·(1 + m·z). In a static scene S = 0 and σ_n² = 2 s²/x². The
 mean of Q(u (r + m z)) over a normal z, u = θ/σ_n, is exactly Q(r u/√(1 + m² u²)).
 
-Arrays are NumPy's or Dr.Jit's (`hesim_render.core.namespace`), probabilities NumPy's alone; nothing here draws a
+Arrays are NumPy's or Dr.Jit's (`hesim_render.core.device_types`), probabilities NumPy's alone; nothing here draws a
 random number.
 """
 
@@ -26,8 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from hesim_render.core.device_types import Values
-from hesim_render.core.namespace import Namespace
+from hesim_render.core.device_types import Namespace, Values
 
 ShotLaw = Literal["linear", "sqrt"]
 

@@ -14,9 +14,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.core.device_types import Float
+from hesim_render.core.device_types import NUMPY, Float
 from hesim_render.core.errors import RangeError
-from hesim_render.core.namespace import NUMPY
 from hesim_render.core.plain import PlainState
 from hesim_render.core.rng import Stream, device_normal
 from hesim_render.core.units import S_PER_US

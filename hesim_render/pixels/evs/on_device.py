@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
-from hesim_render.core.device_types import Float, UInt32
-from hesim_render.core.namespace import device_namespace
+from hesim_render.core.device_types import Float, UInt32, device_namespace
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.arrays import to_device
 from hesim_render.pixels.evs import formulas

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Float64, UInt32
-from hesim_render.core.rng import Stream, philox, stream_key
+from hesim_render.core.rng import Stream, normal_pair, philox, stream_key
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.formulas import POLE
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.photoreceptor import Photoreceptor
-from hesim_render.pixels.normal import normal_pair
 
 #: Nodes of the noise per period of the photoreceptor's cut-off frequency.
 NODES_PER_CUTOFF_PERIOD = 16

@@ -1,6 +1,5 @@
 """Hyperspectral cubes as a source of flux, still or moving."""
 
-from hesim_render.sources.cube.flux import CubeFlux
-from hesim_render.sources.cube.options import CubeOptions
+from hesim_render.sources.cube.flux import CubeFlux, CubeOptions
 
 __all__ = ["CubeFlux", "CubeOptions"]

@@ -20,7 +20,7 @@ from hesim_render.sensor.distortion import Distortion
 from hesim_render.sensor.lens import pixel_centres_mm
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.projection import Projection
-from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
+from hesim_render.sources.render.scene.mitsuba_scene import MitsubaCamera
 from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.scene import CameraSpec, SceneSpec, Vector

@@ -15,12 +15,12 @@ from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.demand import Demand, Estimate
 from hesim_render.sources.render.glare import VeilingGlare
 from hesim_render.sources.render.renderer import reported
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.timeline import Timeline
 from hesim_render.sources.render.tracer import BLOCK_RAYS, PixelTracer
+from hesim_render.sources.renderer import Demand, Estimate
 from hesim_render.sources.scene import Scene
 from hesim_render.sources.still import WindowByWindow
 from hesim_render.spectral.spectrum import Spectrum

@@ -3,6 +3,8 @@
 The irradiance of all light together, interreflections included, is measured by paths from a point of the plane. Light
 sampling and directions of a Lambertian surface are combined at that point by multiple importance sampling [veach1995];
 beyond it, the scene's own integrator is used.
+
+The levels of all lights of a scene at any time follow from its file.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from math import ceil, log2, pi
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, MitsubaModule, MitsubaObject
@@ -26,6 +29,7 @@ from hesim_render.sources.scene import Scene
 from hesim_render.specs.mitsuba_scene import MitsubaSpec
 from hesim_render.specs.scene import SceneSpec
 from hesim_render.spectral.spectrum import LUMINOUS_EFFICACY_LM_PER_W, RENDERABLE_NM, Spectrum, constant, photopic
+from hesim_render.spectral.waveform import Waveform
 
 #: Relative standard error that is aimed at, and the largest one that is accepted.
 WISH, MOST_ERROR = 1e-3, 1e-2
@@ -214,3 +218,47 @@ def _beyond_one(mi: MitsubaModule, built: BuiltScene, spec: SceneSpec, key: str)
     if plugin["type"] == "direct" or 0 <= depth <= 2:
         return None
     return mi.load_dict({**plugin, "max_depth": depth - 1 if depth > 0 else -1, "hide_emitters": False})
+
+
+@dataclass(frozen=True, eq=False)
+class LightLevels:
+    """Level of one light on its own plane.
+
+    Parameters
+    ----------
+    name : ``light`` or ``lights.N`` of a scene file, ``target`` or ``objects.NAME`` for one that shines itself, or the
+        name of a Mitsuba scene's emitter with a waveform.
+    unit : ``lx``, ``W m^-2``, ``cd m^-2``, or ``1`` for the power over its mean.
+    mean : time mean.
+    level : level at the given times, in the shape of these.
+    """
+
+    name: str
+    unit: str
+    mean: float
+    level: NDArray[np.float64]
+
+
+def light_levels(scene: Scene, t_us: ArrayLike) -> list[LightLevels]:
+    """Levels of all lights of a scene at given times, µs."""
+    times = np.asarray(t_us, dtype=np.float64)
+    levels = []
+    for number, light in enumerate(scene.spec.lights):
+        if light.type == "none":
+            continue
+        name = "light" if len(scene.spec.lights) == 1 else f"lights.{number}"
+        lux = light.illuminance_lux
+        mean, unit = (lux, "lx") if lux is not None else (float(light.irradiance_w_m2 or 0.0), "W m^-2")
+        power = _power(None if light.waveform is None else light.waveform.load(), times)
+        levels.append(LightLevels(name, unit, float(mean), mean * power))
+    for name, lamp in scene.spec.named_lamps:
+        power = _power(None if lamp.waveform is None else lamp.waveform.load(), times)
+        levels.append(LightLevels(name, "cd m^-2", lamp.luminance_cd_m2, lamp.luminance_cd_m2 * power))
+    if scene.spec.mitsuba is not None:
+        for name, spec in scene.spec.mitsuba.waveforms.items():
+            levels.append(LightLevels(name, "1", 1.0, _power(spec.load(), times)))
+    return levels
+
+
+def _power(waveform: Waveform | None, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.ones(t_us.shape) if waveform is None else np.asarray(waveform.mean(t_us, t_us), dtype=np.float64)

@@ -13,7 +13,7 @@ import numpy as np
 from hesim_render.core.progress import in_words
 from hesim_render.core.units import S_PER_US
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.demand import Estimate
+from hesim_render.sources.renderer import Estimate
 from hesim_render.specs.event_pixels import EvsSpec
 
 #: Processor seconds for a pixel of a picture, of an event sample and of a frame that is read out and stored; seconds

@@ -14,8 +14,7 @@ from hesim_render.core.device_types import Float, Halves
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.progress import Progress
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.demand import Demand
-from hesim_render.sources.renderer import Renderer, Untraced
+from hesim_render.sources.renderer import Demand, Renderer, Untraced
 from hesim_render.sources.still import WindowByWindow
 from hesim_render.sources.video.arrays import ArrayVideo
 from hesim_render.sources.video.clock import Clock, picture_weights

@@ -10,7 +10,7 @@ from test_renderer_pairs import DIFFUSE, LAMP, SKY, plane, sphere
 
 import hesim_render as hr
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.errors import RangeError, SpecError, TooLongError
 from hesim_render.mosaic.schedule import instant_blocks, tick_blocks
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux

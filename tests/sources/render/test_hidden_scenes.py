@@ -26,7 +26,7 @@ from hidden_checks import (
 
 import hesim_render as hr
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.run_settings import noise_models
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.renderer import flickering
 from hesim_render.sources.scene import Scene

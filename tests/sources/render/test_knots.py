@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hesim_render.sources.render.change_driven.estimates import Flux
-from hesim_render.sources.render.change_driven.knots import BlockFlux, Knots
+from hesim_render.sources.render.change_driven.event_blocks import BlockFlux, Knots
 
 CENTRE_US = np.array([3.0, 10, 30, 60, 100, 170])
 

@@ -453,7 +453,7 @@ def test_a_long_file_runs_in_bounded_memory(tmp_path):
     from videos import encode, grey_frames
 
     from hesim_render.capture.loop import Capture
-    from hesim_render.capture.noise_terms import noise_models
+    from hesim_render.capture.run_settings import noise_models
 
     path = encode(tmp_path / "a.mp4", grey_frames(np.arange(10_000) % 200 + 20, 32, 32), "mpeg4", 30)
     sensor = hr.load_sensor("reference-bayer", {"aps.frame_rate_hz": 30, "aps.exposure_us": 10_000}).crop(16, 16)

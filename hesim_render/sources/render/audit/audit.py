@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.sources.protocol import AuditableFlux
-from hesim_render.sources.render.audit.compare import Counted, compare_crossings, compare_ticks
+from hesim_render.sources.render.audit.compare import Counted, Tally, compare_crossings, compare_ticks
 from hesim_render.sources.render.audit.confidence import lower_bound, ratio_upper_bound, upper_bound
-from hesim_render.sources.render.audit.tally import Tally
 from hesim_render.sources.render.audit.units import NotedFlux, Units
 
 #: Confidence of each stated bound.

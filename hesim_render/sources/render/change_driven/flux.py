@@ -23,15 +23,13 @@ from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress
 from hesim_render.mosaic.schedule import Block, blocks_of_run
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.demand import Demand, Estimate
 from hesim_render.sources.protocol import AuditableFlux, Sample
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Counts, Flux
-from hesim_render.sources.render.change_driven.event_blocks import INTERVALS, Blocks
+from hesim_render.sources.render.change_driven.event_blocks import INTERVALS, BlockFlux, Blocks
 from hesim_render.sources.render.change_driven.forecast import forecast
-from hesim_render.sources.render.change_driven.knots import BlockFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
 from hesim_render.sources.render.change_driven.retrace import KnownPairs, traced_again
@@ -40,6 +38,7 @@ from hesim_render.sources.render.change_driven.tuning import TUNING, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.exact import require_finite, used_responses
 from hesim_render.sources.render.renderer import reported
+from hesim_render.sources.renderer import Demand, Estimate
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.waveform import Waveform
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.sources.demand import Demand, Estimate
 from hesim_render.sources.render.change_driven.anchor import anchor_us, period_us
+from hesim_render.sources.renderer import Demand, Estimate
 
 if TYPE_CHECKING:
     from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux

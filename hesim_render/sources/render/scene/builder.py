@@ -14,8 +14,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene import lights
 from hesim_render.sources.render.scene.deformation import Deformation
 from hesim_render.sources.render.scene.mesh_file import mesh_shapes
-from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
-from hesim_render.sources.render.scene.mitsuba_scene import load_mitsuba, path_tracer
+from hesim_render.sources.render.scene.mitsuba_scene import MitsubaCamera, load_mitsuba, path_tracer
 from hesim_render.sources.render.scene.mitsuba_version import (
     Movable,
     as_spec_error,

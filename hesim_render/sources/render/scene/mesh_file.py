@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.device_types import MitsubaModule
-from hesim_render.core.errors import SpecError
-from hesim_render.core.extras import how_to_install
+from hesim_render.core.errors import SpecError, how_to_install
 from hesim_render.core.guard import WholeFile, leads_out, reading, require_memory, require_plain
 from hesim_render.sources.render.scene.deformation import Deformation, read_deformation
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, make_mesh, transform

@@ -19,7 +19,7 @@ from hesim_render.specs.reflectance import TextureSpec
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectral.spectrum import Spectrum
-from hesim_render.targets.image import read_picture
+from hesim_render.targets.cube import read_picture
 
 #: Shapes without an inside; both of their sides are visible.
 _OPEN_SHAPES = ("rectangle", "mesh")

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.light_level import LightLevels, light_levels
 from hesim_render.sources.render.truth import poses
 from hesim_render.sources.render.truth.boxes import Boxes, ObjectShapes
 from hesim_render.sources.render.truth.chief_rays import ChiefRays, Placed
 from hesim_render.sources.render.truth.flow import Flow, flow_between
 from hesim_render.sources.render.truth.imu import ImuModel, ImuSamples, imu_samples
-from hesim_render.sources.render.truth.light import LightLevels, light_levels
 from hesim_render.sources.render.truth.names import Names
 from hesim_render.sources.render.truth.poses import CameraModel
 from hesim_render.sources.render.truth.raster import Grid, Raster, row_times_us
