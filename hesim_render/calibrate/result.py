@@ -53,7 +53,7 @@ def write_section(
 def _write_section(
     path: Path,
     section: str,
-    data: dict[str, Any],
+    data: Mapping[str, Any],
     content: Mapping[str, Any],
     maps: Mapping[str, NDArray],
     names: list[str],
@@ -64,9 +64,9 @@ def _write_section(
             for name, array in maps.items():
                 archive.add(name, np.asarray(array))
         about = {"file": target.name, "sha256": WholeFile(target).sha256(), **{name: name for name in names}}
-        data[section] = {**content, "maps": about}
+        whole = {**data, section: {**content, "maps": about}}
         with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
-            write_yaml(plain(data), stream)
+            write_yaml(plain(whole), stream)
     finally:
         with contextlib.suppress(OSError, SpecError):  # not what was asked for, and the next run does it
             _remove_unnamed(path, section)

@@ -112,13 +112,12 @@ def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefe
     The parts of the trials in the brightest light distinguish a flickering pixel from a hot one: their scatter has a
     chance below 1e-6 at a constant rate.
     """
-    nothing = np.zeros(bad.size, np.float32)
-    result = TrialDefects(
-        bad, np.zeros(bad.size, np.uint8), nothing, nothing.copy(), np.ones(bad.size, np.float32), nothing.copy()
-    )
+    kind = np.zeros(bad.size, np.uint8)
+    own_hz = np.zeros((2, bad.size), np.float32)
+    firing_share, change_hz = np.ones(bad.size, np.float32), np.zeros(bad.size, np.float32)
     some = np.flatnonzero(bad)
     if some.size == 0:
-        return result
+        return TrialDefects(bad, kind, own_hz[0], own_hz[1], firing_share, change_hz)
     ours, light = steady.of(some), int(np.argmax(steady.signal_dn))
     seconds = max(float(steady.calm[light, ~bad].sum(dtype=np.float64) * steady.edges_s[-1]), 1e-12)
     duration = np.maximum(ours.calm[light] * steady.edges_s[-1], 1e-12)
@@ -130,32 +129,40 @@ def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefe
     hot = never_calm | excess[0] | excess[1]
     # stuck: no event from any step
     silent = (steps.on[..., some].sum(axis=(0, 1)) == 0) & (steps.off[..., some].sum(axis=(0, 1)) == 0) & ~never_calm
-    result.kind[some] = np.where(silent, Defect.STUCK, np.where(hot, Defect.HOT, Defect.OTHER))
+    kind[some] = np.where(silent, Defect.STUCK, np.where(hot, Defect.HOT, Defect.OTHER))
     own = _own_rates(ours, light, never_calm, float(steady.calm[light].max()))
     # flickering: a hot pixel whose events come in some parts of the time and not in others
     if steady.parts is not None:
         flickers = hot & ~silent & unsteady(steady.parts.disturbed[:, some], steady.parts.trials)
-        result.kind[some[flickers]] = Defect.FLICKERING
-        _flicker(result, some[flickers], steady.parts, own[:, flickers])
-    is_hot = result.kind[some] == Defect.HOT
-    result.on_hz[some[is_hot]], result.off_hz[some[is_hot]] = own[:, is_hot]
-    return result
+        which = some[flickers]
+        kind[which] = Defect.FLICKERING
+        own_hz[:, which], firing_share[which], change_hz[which] = _flicker(bad, which, steady.parts, own[:, flickers])
+    is_hot = kind[some] == Defect.HOT
+    own_hz[:, some[is_hot]] = own[:, is_hot]
+    return TrialDefects(bad, kind, own_hz[0], own_hz[1], firing_share, change_hz)
 
 
-def _flicker(result: TrialDefects, pixels: NDArray[np.intp], parts: Parts, own: NDArray[np.float64]) -> None:
-    """Enter the times and rates of flickering pixels.
+def _flicker(
+    bad: NDArray[np.bool_], pixels: NDArray[np.intp], parts: Parts, own: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Times and rates of flickering pixels.
 
     The state of a pixel is taken to be constant during a trial: the share of trials with an event while it fires is
     1 − exp(−rate · trial).
 
     Parameters
     ----------
-    result : where they are entered.
+    bad : [pixel], all bad pixels.
     pixels : the flickering pixels.
     own : [polarity, flickering pixel], mean rates of ON and OFF events, Hz, for the share of ON events.
+
+    Returns
+    -------
+    rates : [polarity, flickering pixel], of events while a pixel fires, Hz.
+    firing_share, change_hz : [flickering pixel], as in `TrialDefects`.
     """
     counts = parts.disturbed[:, pixels]
-    good = parts.disturbed[:, ~result.bad]
+    good = parts.disturbed[:, ~bad]
     usual = float(good.mean(dtype=np.float64)) / parts.trials if good.size else 0.0
     share, correlation = dynamics(counts, parts.trials, usual)
     chance = np.maximum(counts.mean(axis=0, dtype=np.float64) / parts.trials - usual, 0.0) / share
@@ -163,11 +170,10 @@ def _flicker(result: TrialDefects, pixels: NDArray[np.intp], parts: Parts, own: 
     most = 1 - 0.5 / np.maximum(counts.shape[0] * parts.trials * share, 1.0)
     rate = rate_hz(np.minimum(chance, most), parts.trial_s)
     on_share = own[0] / np.maximum(own.sum(axis=0), 1e-300)
-    result.on_hz[pixels], result.off_hz[pixels] = on_share * rate, (1 - on_share) * rate
     switching = (correlation > 0) & (share < 1)
     with np.errstate(divide="ignore"):
         change = -np.log(np.where(switching, correlation, 1.0)) / parts.trial_s
-    result.firing_share[pixels], result.change_hz[pixels] = np.where(switching, share, 1.0), change
+    return np.stack([on_share * rate, (1 - on_share) * rate]), np.where(switching, share, 1.0), change
 
 
 def _own_rates(steady: Trials, light: int, never_calm: NDArray[np.bool_], most: float) -> NDArray[np.float64]:

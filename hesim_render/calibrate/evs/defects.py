@@ -43,8 +43,7 @@ class EventDefects:
     on, off : events per trial of hot and flickering pixels beyond those of a good pixel, 0 elsewhere. For a flickering
         pixel it is the value while it fires where that is known, else the mean.
     firing_share, correlation : for flickering pixels, the fraction of the trials in which they fire and the correlation
-        of
-        that state from trial to trial; 1 and 0 elsewhere, and where they are not known.
+        of that state from trial to trial; 1 and 0 elsewhere, and where they are not known.
     """
 
     bad: NDArray[np.bool_]
@@ -134,13 +133,11 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     of the good pixels of its brightness. A hot pixel gives equal numbers of its own events per trial in the dark and in
     the light and, where counts of parts of a capture are known, in each part.
     """
-    result = EventDefects(
-        bad=bad, kind=np.where(bad, np.uint8(Defect.OTHER), np.uint8(Defect.NONE)),
-        on=np.zeros(bad.shape, np.float32), off=np.zeros(bad.shape, np.float32),
-        firing_share=np.ones(bad.shape, np.float32), correlation=np.zeros(bad.shape, np.float32),
-    )  # fmt: skip
+    kind = np.where(bad, np.uint8(Defect.OTHER), np.uint8(Defect.NONE))
+    own_chance = np.zeros((2, *bad.shape), np.float32)
+    firing_share, correlation = np.ones(bad.shape, np.float32), np.zeros(bad.shape, np.float32)
     if not bad.any():
-        return result
+        return EventDefects(bad, kind, own_chance[0], own_chance[1], firing_share, correlation)
     silent = np.ones(int(bad.sum()), bool)
     own, excess, significant = [], [], []
     for signal, on, off in static.sessions:
@@ -165,19 +162,19 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     named = np.full(silent.shape, np.uint8(Defect.OTHER))
     named[over] = np.where(steady[over], np.uint8(Defect.HOT), np.uint8(Defect.FLICKERING))
     named[silent] = Defect.STUCK
-    result.kind[bad] = named
+    kind[bad] = named
     # a polarity with no more events than good pixels have does not count: its threshold may be low
     chance = np.where(np.any(significant, axis=0), rates.mean(axis=0), 0.0)
     flickers = np.flatnonzero(named == Defect.FLICKERING)
     if static.parts is not None and flickers.size:
-        share, correlation = dynamics(
+        which = tuple(axis[flickers] for axis in np.nonzero(bad))
+        share, correlation[which] = dynamics(
             static.parts[:, bad][:, flickers], static.part_trials, (usual[0] + usual[1])[flickers]
         )
-        for values, all_of_them in ((share, result.firing_share), (correlation, result.correlation)):
-            all_of_them[tuple(axis[flickers] for axis in np.nonzero(bad))] = values
+        firing_share[which] = share
         chance[:, flickers] = np.minimum(chance[:, flickers] / share, 1.0)
-    result.on[bad], result.off[bad] = chance
-    return result
+    own_chance[:, bad] = chance
+    return EventDefects(bad, kind, own_chance[0], own_chance[1], firing_share, correlation)
 
 
 def _of_like(
