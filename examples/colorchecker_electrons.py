@@ -15,7 +15,7 @@ frame = recording.frames[0]
 
 # A diffuse surface under illuminance E reflects L = ρ·E/π, in W m^-2 sr^-1 nm^-1.
 irradiance = spectra.scale_to_lux(spectra.illuminant("D65"), 1000)
-patch = list(spectra.colorchecker().values())[13]
+patch = list(spectra.colorchecker_reflectances().values())[13]
 wavelength_nm = np.arange(380.0, 781.0)
 radiance = patch.at(wavelength_nm) * irradiance.at(wavelength_nm) / np.pi
 

@@ -12,7 +12,7 @@ from hesim_render.spectral import spectrum as spectra
 
 wavelength_nm = np.arange(380.0, 781.0, 1.0)
 light = spectra.scale_to_lux(spectra.illuminant("LED-B3"), 200)
-radiance = np.array([patch.at(wavelength_nm) for patch in spectra.colorchecker().values()])
+radiance = np.array([patch.at(wavelength_nm) for patch in spectra.colorchecker_reflectances().values()])
 radiance *= light.at(wavelength_nm) / np.pi  # W m^-2 sr^-1 nm^-1, [patch, band]
 
 

@@ -50,7 +50,7 @@ def evaluate_benchmark(
 
     Returns
     -------
-    ``summary`` [task][method][measure]: mean, std and number of values; ``scores``, a list of every single one;
+    ``score_summary`` [task][method][measure]: mean, std and number of values; ``scores``, a list of every single one;
     ``verdicts``: a sentence for each method that is worse than doing nothing, which says why that happens;
     ``digest`` of the benchmark and ``split``; ``unused``: files of `predictions` that belong to no item of these tasks.
 
@@ -94,7 +94,7 @@ def evaluate_benchmark(
         "split": split or "all",
         "clips": len(clips),
         "unused": [] if given is None else given.unused,
-        "summary": summary(scores),
+        "summary": score_summary(scores),
         "verdicts": verdicts(scores, {clip.name for clip in clips if _is_ticked(clip)}),
         "scores": [vars(score) for score in scores],
     }
@@ -126,7 +126,7 @@ def _longer_exposures(clips: Sequence[BenchmarkClip]) -> dict[str, list[Benchmar
     return result
 
 
-def summary(scores: Sequence[Score]) -> Summary:
+def score_summary(scores: Sequence[Score]) -> Summary:
     """Mean, standard deviation and number of the finite values of each measure, by task and method.
 
     Parameters
@@ -147,7 +147,7 @@ def summary(scores: Sequence[Score]) -> Summary:
     return result
 
 
-def table(result: Summary) -> str:
+def score_table(result: Summary) -> str:
     """The means as a text table, one block for each task."""
     lines = []
     for task, methods in result.items():

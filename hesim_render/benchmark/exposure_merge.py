@@ -53,7 +53,7 @@ def flux_of(raw: NDArray, exposure_us: float, aps: ApsSpec, mosaic: Mosaic) -> E
     return ExposureFlux(electrons / seconds, np.where(raw >= top, np.inf, variance / seconds**2), seconds)
 
 
-def merged(exposures: Sequence[ExposureFlux]) -> NDArray[np.float64]:
+def merged_exposures(exposures: Sequence[ExposureFlux]) -> NDArray[np.float64]:
     """Mean flux of several exposures, weighted by their inverse variances; without motion it is the best linear one.
 
     The variance of all has the shot noise of one flux, their mean weighted by the dark variances. With the noisy flux

@@ -16,7 +16,7 @@ import numpy as np
 
 from hesim_render.benchmark.draws import LIGHTS, MOTIONS, SOLIDS, draws, log_uniform, shares
 from hesim_render.benchmark.lamps import lamps
-from hesim_render.benchmark.materials import Palette, patch_names, write_picture
+from hesim_render.benchmark.materials import Palette, patch_names, write_texture
 from hesim_render.benchmark.meshes import mesh
 from hesim_render.benchmark.motions import CAMERA_Z, tracks
 from hesim_render.core.errors import SpecError
@@ -54,7 +54,7 @@ class GeneratedScene:
         for name, text in self.texts.items():
             (folder / name).write_text(text, encoding="utf-8")
         for name, picture in self.pictures.items():
-            write_picture(picture, folder / name)
+            write_texture(picture, folder / name)
         file = folder / SCENE_FILE
         file.write_text(json.dumps(self.content, indent=1) + "\n", encoding="utf-8")  # JSON is YAML, and fast to read
         return file

@@ -15,7 +15,7 @@ from PIL import Image
 
 from hesim_render.benchmark.draws import log_uniform
 from hesim_render.specs.benchmark import ScenesSpec
-from hesim_render.spectral.spectrum import colorchecker
+from hesim_render.spectral.spectrum import colorchecker_reflectances
 from hesim_render.spectral.transfer import encode_exactly
 from hesim_render.targets.leaves import leaves_picture
 
@@ -109,7 +109,7 @@ _LEAST_ALPHA, _MOST_ALPHA = 0.08, 0.4
 
 def patch_names() -> list[str]:
     """Names of the measured reflectances."""
-    return list(colorchecker())
+    return list(colorchecker_reflectances())
 
 
 class Palette:
@@ -142,7 +142,8 @@ class Palette:
         level = self._level()
         if self._patches and self._rng.random() < 0.6:
             name = self._patches[int(self._rng.integers(len(self._patches)))]
-            shape = colorchecker()[name].at(np.clip(_WAVELENGTH_NM, *colorchecker()[name].support_nm))
+            patch = colorchecker_reflectances()[name]
+            shape = patch.at(np.clip(_WAVELENGTH_NM, *patch.support_nm))
             self.measured.add(name)
         else:
             place = (_WAVELENGTH_NM - 360) / 470
@@ -199,7 +200,7 @@ class Palette:
         return {"type": "twosided", "material": inner}
 
 
-def write_picture(source: Any, file: Path) -> None:
+def write_texture(source: Any, file: Path) -> None:
     """Write a texture: an array as PNG, or a copy of a file."""
     if isinstance(source, Path):
         file.write_bytes(source.read_bytes())

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.benchmark.event_filters import FILTERS
-from hesim_render.benchmark.exposure_merge import flux_of, flux_scores, merged
+from hesim_render.benchmark.exposure_merge import flux_of, flux_scores, merged_exposures
 from hesim_render.benchmark.folder import BenchmarkClip
 from hesim_render.benchmark.intensity import intensity_scores, leaky_sum, sharp_over_blurred
 from hesim_render.benchmark.metrics import chamfer, count_error, denoising_scores, rate_error
@@ -227,7 +227,7 @@ class ClipTasks:
             truth, valid = sharp.flux_e_per_s(nearest), self._development.layout.aps_mask
             exposures = [flux_of(frame.raw, frame.exposure_us, aps, self._clip.recording.mosaic) for frame in frames]
             estimates: dict[str, NDArray] = {"shortest": exposures[0].flux, "longest": exposures[-1].flux}
-            estimates["merge"] = merged(exposures)
+            estimates["merge"] = merged_exposures(exposures)
             estimates |= self._predicted("hdr", number, truth.shape)
             for name, flux in estimates.items():
                 yield Score(self._clip.name, "hdr", name, number, flux_scores(flux, truth, valid))

@@ -156,7 +156,7 @@ def evaluate(
 
     On the clips of a split, for each task.
     """
-    from hesim_render.benchmark.evaluate import evaluate_benchmark, table
+    from hesim_render.benchmark.evaluate import evaluate_benchmark, score_table
 
     if out is not None:
         free_place(out, overwrite, (".json",))
@@ -167,7 +167,7 @@ def evaluate(
             progress=progress,
         )  # fmt: skip
     lines = [f"{result['clips']} clips of {result['benchmark']}, split {result['split']}"]
-    lines += [table(result["summary"]) or "no clip has what these tasks need", *result["verdicts"]]
+    lines += [score_table(result["summary"]) or "no clip has what these tasks need", *result["verdicts"]]
     lines += [] if out is None else [f"in {out}"]
     for name in listed(tasks):
         if name not in result["summary"]:

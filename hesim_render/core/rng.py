@@ -102,10 +102,10 @@ def device_uniform(seed: int, stream: Stream, index: np.ndarray) -> np.ndarray:
     """Number in (0, 1) of every full-sensor index, float64, same shape as `index`; as `device_normal`."""
     flat = np.ascontiguousarray(index, dtype=np.uint32).ravel()
     none = np.zeros(flat.size, np.uint32)
-    return uniform(words(seed, stream, flat, none, none)[0]).reshape(index.shape)
+    return uniform(random_words(seed, stream, flat, none, none)[0]).reshape(index.shape)
 
 
-def words(seed: int, stream: Stream, pixel: np.ndarray, index: np.ndarray, draw: np.ndarray) -> np.ndarray:
+def random_words(seed: int, stream: Stream, pixel: np.ndarray, index: np.ndarray, draw: np.ndarray) -> np.ndarray:
     """Four random words, uint32 [4, n], of each pixel with an index and a draw of its own, uint32 [n] each."""
     import drjit as dr
 

@@ -42,7 +42,7 @@ def exposure_triggers(begin_us: ArrayLike, end_us: ArrayLike) -> NDArray:
     return edges
 
 
-def exposures(triggers: NDArray, channel: int, count: int, file: str | Path) -> tuple[NDArray, NDArray]:
+def exposures_of_pulses(triggers: NDArray, channel: int, count: int, file: str | Path) -> tuple[NDArray, NDArray]:
     """Begin and end of each exposure, µs: those of the pulses of a line.
 
     Parameters

@@ -91,5 +91,5 @@ def patch_means(
 def reference_linear_srgb(light: Spectrum | None = None, dataset: str = "ISO 17321-1") -> NDArray[np.float64]:
     """Linear sRGB of a ColorChecker's 24 patches under a light (default D65), its white adapted to (1, 1, 1)."""
     light = light or spectra.illuminant("D65")
-    patches = list(spectra.colorchecker(dataset).values())
+    patches = list(spectra.colorchecker_reflectances(dataset).values())
     return xyz_to_linear_srgb(tristimulus(light, patches), tristimulus(light, [constant(1.0)])[0])

@@ -55,7 +55,7 @@ def colour_matrix(image: NDArray[np.float32], matrix: ArrayLike) -> NDArray[np.f
     return np.moveaxis(out, 0, -1)
 
 
-def fit_matrix(patches: ArrayLike, reference: ArrayLike) -> ColourFit:
+def fit_srgb_matrix(patches: ArrayLike, reference: ArrayLike) -> ColourFit:
     """The matrix with the least mean ΔE2000 whose rows sum to 1, so that white stays white.
 
     The fit starts from least squares in linear light ([cheung2004], with the white constraint) and minimises

@@ -246,7 +246,7 @@ class ColourMatrix(Strict):
             from hesim_render.spectral import spectrum as spectra
 
             reference = chart.reference_linear_srgb(spectra.illuminant(self.illuminant))
-            result = colour.fit_matrix(chart.patch_means(state.image, self.corners), reference)
+            result = colour.fit_srgb_matrix(chart.patch_means(state.image, self.corners), reference)
             matrix = result.matrix
             state.note(matrix=matrix, mean_delta_e_2000=result.mean_delta_e, max_delta_e_2000=result.max_delta_e)
         state.image = colour.colour_matrix(state.image, matrix)

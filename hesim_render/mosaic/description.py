@@ -180,7 +180,7 @@ def _colour_matrices(
     neutral = responses_to(light, [constant(1.0)], responses)[0]
     if neutral.max() <= 0:  # light and sensor have no wavelength in common: nothing to balance
         light, neutral = daylight, responses_to(daylight, [constant(1.0)], responses)[0]
-    patches = list(spectra.colorchecker().values())
+    patches = list(spectra.colorchecker_reflectances().values())
     white_d65 = tristimulus(daylight, [constant(1.0)])[0]
     if len(responses) == 1:
         return [1.0], [[1.0], [1.0], [1.0]], [(1.0 / np.full(3, white_d65.sum())).tolist()]

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.rng import Stream, uniform, words
+from hesim_render.core.rng import Stream, random_words, uniform
 from hesim_render.core.units import US_PER_S
 
 _PER_CELL = 4.0
@@ -78,7 +78,7 @@ class PoissonPoints:
         if which.size == 0:
             return np.empty(0)
         draw = number.astype(np.uint32) + _MARK
-        return uniform(words(self._seed, self._stream, self._pixel[which], _counter(cell), draw)[0])
+        return uniform(random_words(self._seed, self._stream, self._pixel[which], _counter(cell), draw)[0])
 
     def _points(
         self, which: NDArray[np.intp], cell: NDArray[np.int64]
@@ -92,7 +92,7 @@ class PoissonPoints:
         here, elapsed, block = np.arange(which.size), np.zeros(which.size), 0
         while here.size:
             draw = np.full(here.size, block, np.uint32)
-            result = words(self._seed, self._stream, self._pixel[which[here]], _counter(cell[here]), draw)
+            result = random_words(self._seed, self._stream, self._pixel[which[here]], _counter(cell[here]), draw)
             for k in range(_BLOCK):
                 elapsed = elapsed - np.log(uniform(result[k])) * self._mean_us[which[here]]
                 inside = elapsed < self._cell_us[which[here]]

@@ -189,7 +189,7 @@ class FrameStack:
             yield frame
 
 
-def number(value: NDArray, name: str, file: Path, *, whole: bool = False, least: float = 0.0) -> float:
+def single_number(value: NDArray, name: str, file: Path, *, whole: bool = False, least: float = 0.0) -> float:
     """The single number that an array holds.
 
     Raises

@@ -121,11 +121,11 @@ class StoredFrames(Sequence[Frame]):
         manifest, key = self._folder / manifests.MANIFEST_NAME, f"frames.{range(len(self))[index]}"
         truth_file = inside(self._folder, entry.pop("truth"), file=manifest, key=f"{key}.truth")
         raw = read_dng(inside(self._folder, entry.pop("file"), file=manifest, key=f"{key}.file"), self._shape)
-        mean, stderr = read_maps(truth_file, ("electrons_mean", "electrons_stderr"), self._shape)
+        mean, stderr = read_frame_maps(truth_file, ("electrons_mean", "electrons_stderr"), self._shape)
         return Frame(raw, self._valid, mean, stderr, **entry)
 
 
-def read_maps(file: Path, names: tuple[str, ...], shape: tuple[int, int]) -> list[NDArray[np.float32]]:
+def read_frame_maps(file: Path, names: tuple[str, ...], shape: tuple[int, int]) -> list[NDArray[np.float32]]:
     """float32 maps of one shape from an `.npz` file, in the order of `names`."""
     result = read_arrays(file, names, only=names, shapes=dict.fromkeys(names, shape), kinds="f")
     return [result[name].astype(np.float32, copy=False) for name in names]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.exchange import EventStream, mcap_file, open_events
-from hesim_render.exchange.triggers import exposures
+from hesim_render.exchange.triggers import exposures_of_pulses
 from hesim_render.mosaic.description import describe
 from hesim_render.recording.camera_raw import CAMERA_SUFFIXES, read_camera_raw, read_raw
 from hesim_render.recording.dng import is_packed
@@ -122,7 +122,7 @@ def _events(file: str | Path, sensor: Sensor) -> EventStream:
 
 def _triggered(stream: EventStream, channel: int, count: int) -> list[tuple[int, int]]:
     """Begin and length of each exposure, µs, by the triggers of a line."""
-    begin, end = exposures(stream.triggers(), channel, count, stream.source)
+    begin, end = exposures_of_pulses(stream.triggers(), channel, count, stream.source)
     if np.any(end <= begin):
         raise SpecError(f"has pulses of triggers on line {channel} without length", file=stream.source)
     return list(zip(begin.tolist(), (end - begin).tolist(), strict=True))

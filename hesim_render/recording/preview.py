@@ -100,7 +100,7 @@ def busiest_window(picture: Picture, fraction: float) -> tuple[float, float]:
     return corners[int(np.argmax(spread))]
 
 
-def contact_sheet(panels: Sequence[Panel], title: str, width_px: int, columns: int = 2) -> Image.Image:
+def panel_sheet(panels: Sequence[Panel], title: str, width_px: int, columns: int = 2) -> Image.Image:
     """Panels of one width side by side with captions, under a title."""
     gap, line = 14, 24
     pictures = [fitted(panel.picture, width_px) for panel in panels]

@@ -28,7 +28,7 @@ from hesim_render.exchange.dsec import read_events, read_numbered_events
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.pixels.evs.events import EVENT_DTYPE, LABELLED_DTYPE, no_events
 from hesim_render.recording import manifest as manifests
-from hesim_render.recording.frame import EventTruth, Frame, StoredFrames, read_maps
+from hesim_render.recording.frame import EventTruth, Frame, StoredFrames, read_frame_maps
 from hesim_render.recording.label_file import LABEL_FILE, OBJECT_FILE, read_causes, read_labels, read_objects
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class Recorded:
         """Noise-free flux of the event pixels, e⁻/s; None where the sensor has no event pixels."""
         if self._event_truth is None and self.path is not None and (self.path / "truth" / "events.npz").is_file():
             names = ("flux_mean_e_per_s", "flux_stderr_e_per_s")
-            maps = read_maps(inside(self.path, "truth/events.npz"), names, self.event_shape)
+            maps = read_frame_maps(inside(self.path, "truth/events.npz"), names, self.event_shape)
             self._event_truth = EventTruth(*maps)
         return self._event_truth
 

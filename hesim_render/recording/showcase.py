@@ -116,7 +116,7 @@ def contact_sheet(recording: Recorded) -> Image.Image:
         )
         if part
     )  # fmt: skip
-    return preview.contact_sheet(panels, printable(title), width_px)
+    return preview.panel_sheet(panels, printable(title), width_px)
 
 
 def _mosaic_panels(frame: Frame, recording: Recorded, colour: Picture, width_px: int, step: int) -> list[Panel]:

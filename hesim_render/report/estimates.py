@@ -47,7 +47,7 @@ def quantile(values: NDArray[np.float64], valid: NDArray[np.bool_], part: float)
     return value, (high - low) / (2 * Z_95), low, high
 
 
-def whole_us(estimate: tuple[float, float, float, float], scale: float = 1.0) -> dict[str, Any]:
+def whole_us_quantile(estimate: tuple[float, float, float, float], scale: float = 1.0) -> dict[str, Any]:
     """A quantile of times that are whole µs as an entry of the report: half a µs is added to either side."""
     value, error, low, high = (scale * number for number in estimate)
     half = 0.5 * scale

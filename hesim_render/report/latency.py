@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hesim_render.calibrate.estimate import not_identifiable
 from hesim_render.report.bench import Responses
-from hesim_render.report.estimates import mean_error, quantile, whole_us
+from hesim_render.report.estimates import mean_error, quantile, whole_us_quantile
 
 #: Part of a normal law within one standard deviation.
 _ONE_SIGMA = 0.6826894921370859
@@ -64,7 +64,7 @@ def answers(one: Responses, polarity: int, good: NDArray[np.bool_], temperature_
     if np.count_nonzero(has_answer) < _LEAST:
         reason = not_identifiable(f"{np.count_nonzero(has_answer)} answers; {_LEAST} are needed")
         return Answers(*about, share, error, len(has_answer), reason, reason, pixels)
-    median = whole_us(quantile(latency, has_answer, 0.5))
+    median = whole_us_quantile(quantile(latency, has_answer, 0.5))
     return Answers(*about, share, error, len(has_answer), median, _jitter(latency, has_answer), pixels)
 
 
@@ -77,4 +77,4 @@ def _jitter(latency: NDArray[np.float64], has_answer: NDArray[np.bool_]) -> dict
     both = has_answer[: 2 * pairs : 2] & has_answer[1 : 2 * pairs : 2]
     if np.count_nonzero(both) < _LEAST:
         return not_identifiable(f"{np.count_nonzero(both)} pairs of answers; {_LEAST} are needed")
-    return whole_us(quantile(np.abs(second - first), both, _ONE_SIGMA), np.sqrt(0.5))
+    return whole_us_quantile(quantile(np.abs(second - first), both, _ONE_SIGMA), np.sqrt(0.5))

@@ -27,7 +27,7 @@ from hesim_render.specs.reflectance import (
 )
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectral.patches import read_patches
-from hesim_render.spectral.spectrum import Spectrum, colorchecker
+from hesim_render.spectral.spectrum import Spectrum, colorchecker_reflectances
 
 
 class FlatTarget(SizedTarget):
@@ -50,7 +50,7 @@ class ColorCheckerTarget(SizedTarget):
     @field_validator("dataset")
     @classmethod
     def _known(cls, value: str) -> str:
-        colorchecker(value)
+        colorchecker_reflectances(value)
         return value
 
 

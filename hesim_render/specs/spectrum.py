@@ -166,7 +166,7 @@ class SpectrumSpec(Strict):
         if self.illuminant is not None:
             return spectra.illuminant(self.illuminant)
         if self.colorchecker is not None:
-            chart = spectra.colorchecker(self.colorchecker)
+            chart = spectra.colorchecker_reflectances(self.colorchecker)
             if isinstance(self.patch, int):
                 if not 1 <= self.patch <= len(chart):
                     raise SpecError(f"patch {self.patch} does not exist; patches are 1 to {len(chart)}")

@@ -3,7 +3,7 @@
 The integral of a product is exact (`integrate_product`); where a product has to be a spectrum itself, it
 is sampled on the merged grid of all factors, refined to 1 nm or finer (0.02 % off; the unrefined merged
 grid is 0.25-0.4 % off, sums of 10 nm rectangles up to 8 %). Named data come from colour-science; see
-`illuminant`, `colorchecker` and `camera_sensitivity`.
+`illuminant`, `colorchecker_reflectances` and `camera_sensitivity`.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def illuminant(name: str) -> Spectrum:
     return _from_colour(_lookup(colour.SDS_ILLUMINANTS, name, "illuminant"))
 
 
-def colorchecker(dataset: str = "ISO 17321-1") -> dict[str, Spectrum]:
+def colorchecker_reflectances(dataset: str = "ISO 17321-1") -> dict[str, Spectrum]:
     """Measured reflectances of the 24 ColorChecker patches, by name, in chart order (row by row).
 
     Parameters

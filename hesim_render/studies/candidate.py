@@ -86,7 +86,7 @@ class Candidate:
         }
 
 
-def candidates(spec: StudySpec) -> list[Candidate]:
+def sensor_candidates(spec: StudySpec) -> list[Candidate]:
     """All sensors with all filter sets of a study.
 
     Raises

@@ -21,7 +21,7 @@ from hesim_render.sensor.sensor import Sensor
 from hesim_render.specs.study import Equal, NamedLight, StudySpec, SurfacesSpec
 from hesim_render.spectral.colorimetry import delta_e_ab, lab
 from hesim_render.spectral.spectrum import Spectrum
-from hesim_render.studies.candidate import Seen, candidates, seen_by
+from hesim_render.studies.candidate import Seen, seen_by, sensor_candidates
 from hesim_render.studies.colour_error import to_srgb
 from hesim_render.studies.colour_noise import GREY
 from hesim_render.studies.colour_samples import ColourSamples, reflectance_set, reflectances_of
@@ -67,7 +67,7 @@ def run_study(spec: StudySpec, progress: Progress | None = None) -> StudyResult:
     SpecError
         If a file is not valid, or parts of the study do not fit together.
     """
-    tried = candidates(spec)
+    tried = sensor_candidates(spec)
     total = len(tried) * len(spec.surfaces) * len(spec.illuminants)
     reference = light_throughput(tried[0].sensor)
     rows: list[dict[str, Cell]] = []
@@ -126,7 +126,7 @@ def _rows(
         event_rate = white_rate(candidate.event_responses, spectrum, lux)
         events: dict[str, Cell] = {}
         if "events" in spec.figures and seen.events is not None:
-            events |= event_figures(
+            events |= tile_event_figures(
                 candidate.sensor, candidate.event_filters, event_rate, seen.events.camera, seen.samples
             )
         aps = candidate.sensor.spec.aps
@@ -175,7 +175,7 @@ def _detail(
 _SAME_LIGHTNESS, _OTHER_COLOUR = 5.0, 20.0
 
 
-def event_figures(
+def tile_event_figures(
     sensor: Sensor,
     filters: list[str],
     white_e_per_s: NDArray[np.float64],

@@ -135,7 +135,7 @@ def reflectance_set(name: str) -> dict[str, Spectrum]:
         If there is no such set.
     """
     if name.startswith("colorchecker"):
-        chart = spectra.colorchecker()
+        chart = spectra.colorchecker_reflectances()
         if name == "colorchecker":
             return {key: held(each) for key, each in chart.items()}
         if name == "colorchecker-chromatic":

@@ -45,7 +45,7 @@ def _sampled(value: Callable[[NDArray, NDArray], NDArray]) -> NDArray[np.float64
     return result
 
 
-def slanted_edge() -> NDArray[np.float64]:
+def edge_picture() -> NDArray[np.float64]:
     """0 on the left of an edge through the centre, 1 on the right, [row, col]."""
     slope = np.tan(np.radians(EDGE_DEG))
     return _sampled(lambda x, y: (x + slope * y > 0).astype(float))
@@ -56,7 +56,7 @@ def star() -> NDArray[np.float64]:
     return _sampled(lambda x, y: (np.sin(SPOKES * np.arctan2(y, x)) > 0).astype(float))
 
 
-def zone_plate() -> NDArray[np.float64]:
+def zone_plate_picture() -> NDArray[np.float64]:
     """½ (1 + cos) of a phase whose frequency rises with the distance, to `ZONE_TOP` at the sides, [row, col]."""
     rate = np.pi * ZONE_TOP / (SIDE_PX / 2)
     return _sampled(lambda x, y: 0.5 * (1 + np.cos(rate * (x**2 + y**2))))
@@ -64,7 +64,7 @@ def zone_plate() -> NDArray[np.float64]:
 
 def chart() -> NDArray[np.float64]:
     """Edge, star and zone plate side by side, [row, col]."""
-    return np.concatenate([slanted_edge(), star(), zone_plate()], axis=1)
+    return np.concatenate([edge_picture(), star(), zone_plate_picture()], axis=1)
 
 
 def distance_px() -> NDArray[np.float64]:

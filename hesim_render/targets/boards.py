@@ -21,7 +21,7 @@ from hesim_render.targets.piece import TargetPiece, around, box, cells, disc, pa
 _TAG_BITS = 6
 
 
-def opencv() -> Any:
+def opencv_module() -> Any:
     """The module ``cv2``.
 
     Raises
@@ -56,7 +56,7 @@ def charuco(target: CharucoTarget) -> list[TargetPiece]:
     SpecError
         If OpenCV is not installed, has no such dictionary, or the dictionary has too few markers.
     """
-    aruco = opencv().aruco
+    aruco = opencv_module().aruco
     dictionary = _dictionary(aruco, target.dictionary)
     board = charuco_board(target)
     bits = dictionary.markerSize + 2
@@ -86,7 +86,7 @@ def charuco_board(target: CharucoTarget) -> Any:
     SpecError
         As `charuco`.
     """
-    aruco = opencv().aruco
+    aruco = opencv_module().aruco
     dictionary = _dictionary(aruco, target.dictionary)
     needed = target.rows * target.cols // 2
     _require_ids(target.first_id + needed, len(dictionary.bytesList), target.dictionary)
@@ -102,7 +102,7 @@ def aprilgrid(target: AprilGridTarget) -> list[TargetPiece]:
     SpecError
         If OpenCV is not installed, or the family has too few tags.
     """
-    aruco = opencv().aruco
+    aruco = opencv_module().aruco
     dictionary = aruco.getPredefinedDictionary(aruco.DICT_APRILTAG_36h11)
     _require_ids(target.first_id + target.rows * target.cols, len(dictionary.bytesList), "36h11")
     bits = _TAG_BITS + 2 * target.border_bits

@@ -81,7 +81,7 @@ def placed_pieces(target: TargetSpec) -> list[TargetPiece]:
 
 def colorchecker(target: ColorCheckerTarget) -> list[TargetPiece]:
     """24 patches on their surround."""
-    return _patches(spectra.colorchecker(target.dataset), 4, 6, target)
+    return _patches(spectra.colorchecker_reflectances(target.dataset), 4, 6, target)
 
 
 def patch_chart(target: PatchChartTarget) -> list[TargetPiece]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render.benchmark.exposure_merge import flux_of, flux_scores, merged
+from hesim_render.benchmark.exposure_merge import flux_of, flux_scores, merged_exposures
 from hesim_render.benchmark.torch_dataset import signal_of
 from hesim_render.isp import Pipeline, demosaic, process
 from hesim_render.isp.smooth import reduce_noise
@@ -92,6 +92,6 @@ def test_exposures_of_a_dark_scene_are_merged_without_bias(dark):
     _, mosaic, _, sensor = dark
     spec = sensor.spec.aps.model_copy(update={"read_noise_e": 2.3})
     noise = np.random.default_rng(8).normal(mosaic.black_level_dn, 2.3 * spec.system_gain_dn_per_e, (2, 200, 150))
-    flux = merged([flux_of(raw, us, spec, mosaic) for raw, us in zip(noise, (20_000, 30_000), strict=True)])
+    flux = merged_exposures([flux_of(raw, us, spec, mosaic) for raw, us in zip(noise, (20_000, 30_000), strict=True)])
     sigma = 2.3 / np.hypot(0.020, 0.030)
     assert abs(flux.mean()) < 5 * sigma / np.sqrt(flux.size) and flux.std() == pytest.approx(sigma, rel=0.05)

@@ -9,7 +9,7 @@ from PIL import Image
 
 from benchmarks import small
 from hesim_render.benchmark import Benchmark, build_benchmark, evaluate_benchmark
-from hesim_render.benchmark.evaluate import NOTHING, summary, table, verdicts
+from hesim_render.benchmark.evaluate import NOTHING, score_summary, score_table, verdicts
 from hesim_render.benchmark.pictures import ClipDevelopment
 from hesim_render.benchmark.predictions import Predictions
 from hesim_render.benchmark.tasks import ClipTasks, Score
@@ -50,7 +50,7 @@ def test_every_task_has_scores(built, tmp_path):
     assert blurred["psnr_db"]["count"] == len(next(built.clips()).recording.frames)
     stored = json.loads((tmp_path / "r.json").read_text())
     assert stored["summary"]["deblur"]["blurred"] == blurred and stored["digest"] == result["digest"]
-    assert "double-integral" in table(found)
+    assert "double-integral" in score_table(found)
     losers = {text.partition(" loses")[0] for text in result["verdicts"]}
     for task, (nothing, measure, way) in NOTHING.items():
         for method in set(found.get(task, ())) - {nothing}:
@@ -197,7 +197,7 @@ def test_flow_of_the_event_grid_is_in_pixels_of_the_mosaic(built):
 
 def test_means_are_over_finite_values():
     scores = [Score("a", "t", "m", k, {"v": value}) for k, value in enumerate((1.0, 3.0, np.inf))]
-    assert summary(scores)["t"]["m"]["v"] == {"count": 2, "mean": 2.0, "std": 1.0}
+    assert score_summary(scores)["t"]["m"]["v"] == {"count": 2, "mean": 2.0, "std": 1.0}
 
 
 def test_what_cannot_be_evaluated_is_refused(built, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render.benchmark.exposure_merge import flux_of, flux_scores, merged
+from hesim_render.benchmark.exposure_merge import flux_of, flux_scores, merged_exposures
 from hesim_render.benchmark.intensity import intensity_scores, leaky_sum
 from hesim_render.benchmark.optical_flow import flow_scores, of_pictures, plane_fit
 from hesim_render.benchmark.predictions import Predictions
@@ -102,7 +102,7 @@ def test_a_merge_of_exposures_has_the_least_error_on_still_light():
         electrons = rng.poisson(flux * exposure_us * 1e-6) + rng.normal(0, aps.read_noise_e, flux.shape)
         raw = np.clip(np.rint(electrons * aps.system_gain_dn_per_e + 64), 0, 4064)
         exposures.append(flux_of(raw, exposure_us, aps, mosaic))
-    merge = merged(exposures)
+    merge = merged_exposures(exposures)
     valid = np.ones(flux.shape, bool)
     # where no exposure clips, the variance is the inverse of the sum of the inverse variances
     dim = flux < 5e5

@@ -18,7 +18,7 @@ from test_round_trips import lists_of_events
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.hdf5 import require_sound_heaps
 from hesim_render.exchange import EVENT_FORMATS, EventStream, ecf, event_packets, mcap_file, open_events, prophesee_hdf5
-from hesim_render.exchange.triggers import TRIGGER_DTYPE, exposure_triggers, exposures
+from hesim_render.exchange.triggers import TRIGGER_DTYPE, exposure_triggers, exposures_of_pulses
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.recording.imports import import_recording
 
@@ -125,11 +125,11 @@ def test_a_line_must_have_a_pulse_for_each_frame():
     given_ = exposure_triggers([5, 50], [19, 73])
     assert given_.tolist() == [(5, 1, 0), (19, -1, 0), (50, 1, 0), (73, -1, 0)]
     both = np.sort(np.concatenate([given_, edges((7, -1, 1), (51, 1, 1))]), order="t_us")
-    begin, end = exposures(both, 0, 2, "file")
+    begin, end = exposures_of_pulses(both, 0, 2, "file")
     assert (begin.tolist(), end.tolist()) == ([5, 50], [19, 73])
     for line, count, told in ((0, 3, "has 4 edges"), (1, 1, "has 2 edges"), (2, 1, r"lines with triggers: 0, 1")):
         with pytest.raises(SpecError, match=told):
-            exposures(both, line, count, "file")
+            exposures_of_pulses(both, line, count, "file")
 
 
 @pytest.mark.parametrize("name", ["evt2", "evt3", "prophesee", "mcap-evt3"])

@@ -49,7 +49,7 @@ def test_rendered_chart_comes_out_within_two_delta_e(light):
     own = patches @ np.array(Camera.of(recording.mosaic).matrix).T
     own *= (own * reference).sum() / (own * own).sum()
     assert difference(own).mean() < 2
-    fit = colour.fit_matrix(patches, reference)
+    fit = colour.fit_srgb_matrix(patches, reference)
     fitted = difference(fit.exposure * patches @ np.array(fit.matrix).T)
     assert fitted.mean() < 1.5
     np.testing.assert_allclose(fit.delta_e_2000, fitted, atol=0.1)

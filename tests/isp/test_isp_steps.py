@@ -171,13 +171,13 @@ def test_fit_finds_the_matrix_that_made_the_patches():
     matrix = np.array([[1.7, -0.6, -0.1], [-0.2, 1.6, -0.4], [0.05, -0.5, 1.45]])
     reference = chart.reference_linear_srgb()
     patches = 0.4 * reference @ np.linalg.inv(matrix).T
-    fit = colour.fit_matrix(patches, reference)
+    fit = colour.fit_srgb_matrix(patches, reference)
     np.testing.assert_allclose(fit.matrix, matrix, atol=1e-3)
     assert fit.exposure == pytest.approx(2.5, rel=1e-3)
     assert fit.max_delta_e < 0.05
     np.testing.assert_allclose(np.sum(fit.matrix, axis=1), 1, atol=1e-12)
     with pytest.raises(RangeError, match="patches and reference"):
-        colour.fit_matrix(patches[:2], reference[:2])
+        colour.fit_srgb_matrix(patches[:2], reference[:2])
 
 
 def test_delta_e_of_a_known_pair():

@@ -11,7 +11,7 @@ from hesim_render.recording import manifest
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.colorimetry import responses_to, tristimulus, xyz_to_linear_srgb
 
-PATCHES = list(spectra.colorchecker().values())
+PATCHES = list(spectra.colorchecker_reflectances().values())
 
 
 @pytest.mark.parametrize("channels", [("green", "red"), ("red", "green", "blue")])

@@ -53,7 +53,7 @@ def test_colorchecker_patches_come_out_in_their_colours():
     """Mean ΔE*ab below 6 against the patches' own sRGB: a 3×3 matrix cannot do much better."""
     import colour
 
-    chart = list(spectra.colorchecker().values())
+    chart = list(spectra.colorchecker_reflectances().values())
     light = spectra.illuminant("D65")
     patches = [chart[k] for k in (18, 14, 13, 12, 15, 2, 8)]  # white, red, green, blue, yellow, blue sky, moderate red
     raw, described = frame_under("eiger", light, patches, width=448)

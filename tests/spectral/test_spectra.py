@@ -31,7 +31,7 @@ def test_a_sum_has_each_table_where_it_is_known():
 
 
 def test_product_of_tables_against_adaptive_quadrature():
-    light, surface = spectra.illuminant("FL11"), list(spectra.colorchecker().values())[13]
+    light, surface = spectra.illuminant("FL11"), list(spectra.colorchecker_reflectances().values())[13]
     low, high = max(light.support_nm[0], surface.support_nm[0]), min(light.support_nm[1], surface.support_nm[1])
     knots = np.union1d(light.wavelength_nm, surface.wavelength_nm)
     exact = sum(
@@ -83,18 +83,18 @@ def test_light_without_luminance_has_no_lux():
 
 def test_coverage_is_a_share_of_the_response():
     response = constant(1.0, 400, 780)
-    babel = spectra.colorchecker("BabelColor Average")["dark skin"]
+    babel = spectra.colorchecker_reflectances("BabelColor Average")["dark skin"]
     assert babel.support_nm[1] == 730
     assert spectra.coverage(babel, response) == pytest.approx(330 / 380, rel=1e-9)
     with pytest.raises(SpecError, match=r"BabelColor covers 380-730 nm, only 86\.84% of the response of mono"):
         spectra.require_coverage(babel, response, "BabelColor", "mono")
     spectra.require_coverage(babel, constant(1.0, 400, 730.3), "BabelColor", "mono")  # 99.9 % is enough
-    spectra.require_coverage(spectra.colorchecker()["dark skin"], response, "ISO 17321-1", "mono")
+    spectra.require_coverage(spectra.colorchecker_reflectances()["dark skin"], response, "ISO 17321-1", "mono")
 
 
 def test_colorchecker_has_24_patches_in_chart_order():
     for name in ("ISO 17321-1", "BabelColor Average", "ColorChecker N Ohta"):
-        chart = list(spectra.colorchecker(name).values())
+        chart = list(spectra.colorchecker_reflectances(name).values())
         assert len(chart) == 24
         # the last row is grey, from white to black
         grey = np.array([patch.at(550) for patch in chart[18:]])
@@ -105,7 +105,7 @@ def test_unknown_names_list_the_known_ones():
     with pytest.raises(SpecError, match=r"unknown illuminant 'D66'; known are .*'D65'"):
         spectra.illuminant("D66")
     with pytest.raises(SpecError, match="unknown ColorChecker data set"):
-        spectra.colorchecker("x")
+        spectra.colorchecker_reflectances("x")
     with pytest.raises(SpecError, match="has no channel 'ir'; it has red, green, blue"):
         spectra.camera_sensitivity("Nikon 5100 (NPL)", "ir")
     assert {"D65", "A", "FL11", "LED-B3"} <= set(spectra.illuminant_names())

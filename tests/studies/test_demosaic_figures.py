@@ -14,13 +14,13 @@ STUDY = {"schema_version": 1, "name": "detail", "sensors": ["reference-bayer"], 
 
 def test_patterns_are_means_over_pixels():
     """The box of a pixel has the MTF sinc; half of the star is bright; a zone plate has its phase at each place."""
-    edge = edge_response(demosaic_figures.slanted_edge()[8:-8, 8:-8])
+    edge = edge_response(demosaic_figures.edge_picture()[8:-8, 8:-8])
     assert edge.angle_deg == pytest.approx(-5, abs=0.05) or edge.angle_deg == pytest.approx(5, abs=0.05)
     # along the normal of an edge tilted by 5°, the pixel is nearly a box of 1 px
     np.testing.assert_allclose(edge.mtf[[10, 25, 50]], np.sinc([0.1, 0.25, 0.5]), atol=0.01)
     star = demosaic_figures.star()
     assert star.mean() == pytest.approx(0.5, abs=1e-6) and star.min() == 0 and star.max() == 1
-    zone = demosaic_figures.zone_plate()
+    zone = demosaic_figures.zone_plate_picture()
     side = demosaic_figures.SIDE_PX
     row = zone[side // 2, side // 2 :] - 0.5
     x = np.arange(side // 2) + 0.5

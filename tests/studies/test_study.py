@@ -75,7 +75,9 @@ def test_one_pixel_with_many_filter_sets_orders_in_dim_light_as_photon_counting_
     d65, grid = spectra.illuminant("D65"), np.arange(360.0, 831.0)
     power = 3 * d65.at(grid) / np.trapezoid(d65.at(grid) * spectra.photopic().at(grid), grid)
     power /= LUMINOUS_EFFICACY_LM_PER_W
-    patches = np.array([each.at(np.clip(grid, *each.support_nm)) for each in spectra.colorchecker().values()])
+    patches = np.array(
+        [each.at(np.clip(grid, *each.support_nm)) for each in spectra.colorchecker_reflectances().values()]
+    )
     observed = spectra.colour_matching_functions()[1].at(grid) * power
     # read noise, dark current of 15 ms, rounding of a gain of 0.038 DN per electron
     dark = 45**2 + 9.1 * 0.015 + 1 / 12 / 0.038**2

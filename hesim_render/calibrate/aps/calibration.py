@@ -62,7 +62,7 @@ def calibrate_aps(
         calibrate_pairs(folder, out, report, progress, overwrite)
         return Path(out)
     captures = read_captures(folder)
-    check_calibration(out, describe(captures))
+    check_calibration(out, described_captures(captures))
     if report is not None:
         check_report(out, report, overwrite)
     stacks = captures.frames("aps_dark"), captures.frames("aps_lit")
@@ -75,7 +75,11 @@ def calibrate_aps(
     telegraph = find_telegraph(stacks[0], dark, used, tile, captures.spec.full_scale_dn)
     result, dark, lit = analyse(captures, dark, lit, used, telegraph)
     write_section(
-        out, "aps", describe(captures), content(captures, result, dark, lit), maps(captures, result, lit, dark)
+        out,
+        "aps",
+        described_captures(captures),
+        content(captures, result, dark, lit),
+        maps(captures, result, lit, dark),
     )
     if report is not None:
         from hesim_render.calibrate.report.page import write_report
@@ -84,7 +88,7 @@ def calibrate_aps(
     return Path(out)
 
 
-def describe(captures: CaptureSet) -> dict[str, Any]:
+def described_captures(captures: CaptureSet) -> dict[str, Any]:
     """Description of the captures for a calibration."""
     return captures.spec.model_dump(exclude_none=True, mode="json")
 

@@ -14,7 +14,7 @@ from scipy.special import logsumexp
 from scipy.stats import f as f_law
 from scipy.stats import norm, poisson
 
-from hesim_render.calibrate.asynchronous.fit import Fit, middle_and_spread, pixel_thresholds
+from hesim_render.calibrate.asynchronous.fit import Fit, median_and_spread, pixel_thresholds
 from hesim_render.calibrate.asynchronous.likelihood import LEAK, MISMATCH, THETA, chances, log_prior, step_of
 from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.calibrate.estimate import ALARM, Finding
@@ -180,7 +180,7 @@ def _ceiling(steps: Trials) -> Finding | None:
     """Finding of missing events at steps beyond four spreads of the pixels' own middle contrasts."""
     lost, total = np.zeros(steps.calm.shape[1]), 0.0
     for polarity in (1, -1):
-        middle, spread = middle_and_spread(pixel_thresholds(steps, polarity))
+        middle, spread = median_and_spread(pixel_thresholds(steps, polarity))
         there = steps.towards(polarity)
         sure = np.abs(there.contrast) > middle * (1 + _FAR * spread)
         sure &= there.signal_dn >= 0.999 * there.signal_dn.max()

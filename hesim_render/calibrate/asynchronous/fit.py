@@ -159,7 +159,7 @@ def rough_start(steady: Trials, steps: Trials, good: NDArray[np.bool_], law: Law
     in all lights, and m, β3² and β4² are the least squares of w².
     """
     good_steps = steps.of(good)
-    spread = [middle_and_spread(pixel_thresholds(good_steps, p))[1] for p in (1, -1)]
+    spread = [median_and_spread(pixel_thresholds(good_steps, p))[1] for p in (1, -1)]
     curves = [curve for p in (1, -1) for curve in _pooled_curves(good_steps, p)]
     light = np.array([c[1] for c in curves])
     if light.size == 0:
@@ -243,7 +243,7 @@ def pixel_thresholds(steps: Trials, polarity: int) -> NDArray[np.float64]:
     return contrast[0] + np.trapezoid(missing, contrast, axis=0)
 
 
-def middle_and_spread(values: NDArray) -> tuple[float, float]:
+def median_and_spread(values: NDArray) -> tuple[float, float]:
     """Median, and relative spread by quartiles, which a few bad pixels do not change."""
     low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
     return float(middle), float((high - low) / 1.349 / max(middle, 1e-12))

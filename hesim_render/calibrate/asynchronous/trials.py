@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.core.npz import read_arrays
 from hesim_render.core.units import S_PER_US
-from hesim_render.recording.capture_set import BRIGHTEST_DN, SIGNAL_RANGE, CaptureSet, number
+from hesim_render.recording.capture_set import BRIGHTEST_DN, SIGNAL_RANGE, CaptureSet, single_number
 
 NOISE_RATE, S_CURVE = "evs_noise_rate", "evs_s_curve"
 _ARRAYS = ("signal_dn", "settle_us", "edges_us", "n_calm", "n_on", "n_off")
@@ -149,7 +149,7 @@ def _read(file: Path, has_steps: bool) -> Trials:
         raise SpecError(SIGNAL_RANGE, file=file)
     contrast = _list(arrays.get("contrast", np.zeros(signal.size)), "contrast", file)
     _require_contrast(contrast, signal, has_steps, file)
-    settle_s = number(arrays["settle_us"], "settle_us", file) * S_PER_US
+    settle_s = single_number(arrays["settle_us"], "settle_us", file) * S_PER_US
     edges = _list(arrays["edges_us"], "edges_us", file)
     if edges.size < 2 or edges[0] != 0 or np.any(np.diff(edges) <= 0):
         raise SpecError(
@@ -216,8 +216,8 @@ def _parts(
         if name not in arrays:
             raise SpecError(f"holds bright_parts and no {name!r}, which belongs to it", file=file)
     disturbed = arrays["bright_parts"]
-    trials = int(number(arrays["part_trials"], "part_trials", file, whole=True, least=2))
-    part_s = number(arrays["part_us"], "part_us", file) * S_PER_US
+    trials = int(single_number(arrays["part_trials"], "part_trials", file, whole=True, least=2))
+    part_s = single_number(arrays["part_us"], "part_us", file) * S_PER_US
     if disturbed.ndim != 3 or disturbed.shape[1:] != calm.shape[1:] or disturbed.dtype.kind not in "ui":
         raise SpecError(f"bright_parts must be whole numbers [part, row, col] of {calm.shape[1:]} pixels", file=file)
     if len(disturbed) < _FEWEST_PARTS:

@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.aps.calibration import describe
+from hesim_render.calibrate.aps.calibration import described_captures
 from hesim_render.calibrate.asynchronous.analysis import analyse_trials
 from hesim_render.calibrate.asynchronous.trials import is_asynchronous
 from hesim_render.calibrate.evs.analysis import analyse, bootstrap_errors
@@ -57,7 +57,7 @@ def calibrate_evs(
     from hesim_render.calibrate.result import check_calibration, check_report, write_section
 
     captures = read_captures(folder)
-    check_calibration(out, describe(captures))
+    check_calibration(out, described_captures(captures))
     if report is not None:
         check_report(out, report, overwrite)
     tell = progress or (lambda what, fraction: None)
@@ -71,7 +71,7 @@ def calibrate_evs(
     else:
         section, maps = _fixed_ticks(captures, out, tell, bootstrap, seed)
     tell("writing", 0.95)
-    write_section(out, "evs", describe(captures), section, maps)
+    write_section(out, "evs", described_captures(captures), section, maps)
     if report is not None:
         from hesim_render.calibrate.report.page import write_report
 

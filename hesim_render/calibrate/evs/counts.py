@@ -12,7 +12,7 @@ from hesim_render.calibrate.result import read_calibration, read_maps
 from hesim_render.core.errors import SpecError
 from hesim_render.core.output import alone_in
 from hesim_render.core.units import S_PER_US
-from hesim_render.recording.capture_set import BRIGHTEST_DN, SIGNAL_RANGE, CaptureSet, number
+from hesim_render.recording.capture_set import BRIGHTEST_DN, SIGNAL_RANGE, CaptureSet, single_number
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def read_static(captures: CaptureSet, calibration: str | Path | None = None) -> 
     signal = np.asarray(data["signal_dn"]) if "signal_dn" in data else _composite_signal(captures, calibration, file)
     if signal.ndim != 2 or signal.dtype.kind not in "uif" or signal.size == 0:
         raise SpecError(f"signal_dn has shape {signal.shape}; expected numbers [row, col]", file=file)
-    trials = int(number(data["n_trials"], "n_trials", file, whole=True, least=1))
+    trials = int(single_number(data["n_trials"], "n_trials", file, whole=True, least=1))
     names = [name for name in ("n_on", "n_off", "dark_n_on", "dark_n_off") if name in data]
     if len(names) == 3:
         raise SpecError("dark_n_on and dark_n_off are given together or not at all", file=file)

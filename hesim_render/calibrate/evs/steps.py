@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.npz import read_arrays
-from hesim_render.recording.capture_set import BRIGHTEST_DN, SIGNAL_RANGE, CaptureSet, count_maps, number
+from hesim_render.recording.capture_set import BRIGHTEST_DN, SIGNAL_RANGE, CaptureSet, count_maps, single_number
 
 #: Number of groups of pixels with separate sums; each group is left out in turn (jackknife).
 GROUPS = 100
@@ -61,7 +61,7 @@ def read_steps(captures: CaptureSet, good: NDArray[np.bool_]) -> Steps:
     """
     file = captures.folder / "evs_steps.npz"
     contrast, signal, small = read_contrast(captures, ("n_trials",))
-    trials = int(number(small["n_trials"], "n_trials", file, whole=True, least=1))
+    trials = int(single_number(small["n_trials"], "n_trials", file, whole=True, least=1))
     if signal.size > 1:
         if signal.shape != good.shape:
             raise SpecError(f"signal_dn is of size {signal.shape}; expected one number or {good.shape}", file=file)

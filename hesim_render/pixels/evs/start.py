@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from hesim_render.core.rng import Stream, uniform, words
+from hesim_render.core.rng import Stream, random_words, uniform
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.formulas import POLE
 from hesim_render.pixels.evs.model import EvsNoise
@@ -251,7 +251,7 @@ def start_chances(noise: EvsNoise, seed: int) -> NDArray[np.float64]:
     """Three uniform random numbers of each pixel, [3, pixel]."""
     key = noise.layout.full_index.ravel()[noise.layout.evs_pixel.ravel()]
     none = np.zeros(key.size, np.uint32)
-    return uniform(words(seed, Stream.EVENT_START, key, none, none)[:3])
+    return uniform(random_words(seed, Stream.EVENT_START, key, none, none)[:3])
 
 
 def _place(value: NDArray[np.float64], nodes: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:

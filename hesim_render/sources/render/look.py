@@ -31,7 +31,7 @@ _SKY = (0.25, 0.30, 0.40)
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class FramingLook:
     """The framing of a scene.
 
     Parameters
@@ -48,7 +48,7 @@ class Look:
     materials: dict[str, list[FileMaterial]] = field(default_factory=dict)
 
 
-def look(scene: Scene, sensor: Sensor) -> Look:
+def look(scene: Scene, sensor: Sensor) -> FramingLook:
     """Show what a sensor sees of a scene at t = 0, as a picture without light, noise and filters.
 
     Each pixel has the diffuse reflectance at three wavelengths of the first surface, darker where it is seen at a
@@ -84,7 +84,7 @@ def look(scene: Scene, sensor: Sensor) -> Look:
     rim = outline(scene.spec, view)
     picture = encode(np.clip(shown, 0, 1).astype(np.float32), "srgb", depth=8)
     drawn = _with_lines(picture, region, None if rim is None else (rim + beside) / scale)
-    return Look(drawn, region, framing(scene.spec, view), file_materials(scene.spec))
+    return FramingLook(drawn, region, framing(scene.spec, view), file_materials(scene.spec))
 
 
 def _colours(mi: MitsubaModule, scene: MitsubaObject, view: View, x: NDArray, y: NDArray) -> NDArray[np.float64]:

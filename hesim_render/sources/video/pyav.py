@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import WholeFile, require_picture
+from hesim_render.core.guard import WholeFile, reason, require_picture
 from hesim_render.sources.video.arrays import without_alpha
 from hesim_render.sources.video.colours import ColourTags
 from hesim_render.sources.video.picture import PictureFormat, Planes
@@ -135,8 +135,3 @@ def require_decodable(stream: Any, file: Path) -> None:
     """
     context = stream.codec_context
     require_picture(context.width, context.height, _PIXEL_BYTES, file)
-
-
-def reason(error: BaseException) -> str:
-    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return str(text).splitlines()[0]

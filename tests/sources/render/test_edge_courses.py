@@ -5,7 +5,7 @@ import pytest
 
 from hesim_render.sources.render.change_driven import edge_courses
 from hesim_render.sources.render.change_driven.edge_courses import Courses, courses, fitted_windows
-from hesim_render.sources.render.change_driven.edges import EdgeFit, coverage
+from hesim_render.sources.render.change_driven.edges import EdgeFit, halfplane_share
 from hesim_render.sources.render.change_driven.estimates import Flux
 
 #: Middles of windows, unevenly spaced, µs.
@@ -22,7 +22,7 @@ def line(time_us, pixel):
 
 def flux(pixel):
     angle, offset = line(CENTRE, pixel)
-    return LOW[pixel] + (HIGH[pixel] - LOW[pixel]) * coverage(np.cos(angle), np.sin(angle), offset)
+    return LOW[pixel] + (HIGH[pixel] - LOW[pixel]) * halfplane_share(np.cos(angle), np.sin(angle), offset)
 
 
 def fits(window, pixel, **changed):
@@ -113,7 +113,7 @@ def test_the_pilot_sees_the_share_of_its_own_area():
     wide = np.empty_like(PILOT)
     for pixel in (0, 1):
         angle, offset = line(CENTRE, pixel)
-        share = coverage(np.cos(angle), np.sin(angle), offset / 3.0)
+        share = halfplane_share(np.cos(angle), np.sin(angle), offset / 3.0)
         wide[:, pixel] = LOW[pixel] + (HIGH[pixel] - LOW[pixel]) * share
     assert course(pilot=wide, footprint=3.0).window.size == 15
     assert course(pilot=wide, footprint=1.0).window.size < 15
@@ -153,7 +153,7 @@ def test_directions_are_joined_across_half_a_turn():
     fit = fits(window, pixel, normal_x=np.cos(angle), normal_y=np.sin(angle), offset=[-0.2, 0.3])
     part = (CENTRE - CENTRE[2]) / (CENTRE[7] - CENTRE[2])
     middle = angle[0] + part * (angle[1] - angle[0])
-    share = coverage(np.cos(middle), np.sin(middle), -0.2 + 0.5 * part)
+    share = halfplane_share(np.cos(middle), np.sin(middle), -0.2 + 0.5 * part)
     pilot = np.stack([LOW[0] + (HIGH[0] - LOW[0]) * share] * 2, axis=1).astype(np.float32)
     found = courses(window, pixel, fit, pilot, 1.0, WANTED[pixel], CENTRE, np.zeros(PILOT.shape, np.bool_))
     assert found.window.tolist() == [3, 4, 5, 6]

@@ -11,7 +11,7 @@ import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
-from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges, coverage
+from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges, halfplane_share
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -30,8 +30,8 @@ def test_the_share_of_a_pixel_beside_a_line():
     x, y, offset = lines(rng, 60)
     points = rng.random((2, 500_000)) - 0.5
     counted = [np.mean(a * points[0] + b * points[1] + c > 0) for a, b, c in zip(x, y, offset, strict=True)]
-    np.testing.assert_allclose(coverage(x, y, offset), counted, atol=4e-3)
-    np.testing.assert_allclose(coverage(x, y, offset) + coverage(-x, -y, -offset), 1, atol=1e-6)
+    np.testing.assert_allclose(halfplane_share(x, y, offset), counted, atol=4e-3)
+    np.testing.assert_allclose(halfplane_share(x, y, offset) + halfplane_share(-x, -y, -offset), 1, atol=1e-6)
 
 
 def fitted(x, y, flux):

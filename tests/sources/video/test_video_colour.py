@@ -224,11 +224,11 @@ def test_spectral_mode_against_measured_surfaces():
     """24 ColorChecker patches through Nikon curves, from their sRGB alone: 3.1 % off on average, 22 % at most (the blue
     of orange, its darkest channel), greys 0.6 %. Metamers differ: that is the limit of any upsampling."""
     from hesim_render.spectral.colorimetry import tristimulus, xyz_to_linear_srgb
-    from hesim_render.spectral.spectrum import colorchecker, constant, integrate_product, scale_to_lux
+    from hesim_render.spectral.spectrum import colorchecker_reflectances, constant, integrate_product, scale_to_lux
 
     sensor = hr.load_sensor("reference-bayer")
     light, names = illuminant("D65"), sensor.layout.filters
-    patches = list(colorchecker().values())
+    patches = list(colorchecker_reflectances().values())
     rgb = xyz_to_linear_srgb(tristimulus(light, patches), tristimulus(light, [constant(1.0)])[0])
     irradiance = scale_to_lux(light, 1000)
     exact = np.array(

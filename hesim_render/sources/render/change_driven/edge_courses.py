@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.sources.render.change_driven.edges import EdgeFit, coverage
+from hesim_render.sources.render.change_driven.edges import EdgeFit, halfplane_share
 from hesim_render.sources.render.change_driven.estimates import Flux
 
 #: A line is fitted in every so many of the windows in which a pixel changes, and where the next ones are farther.
@@ -141,14 +141,14 @@ def courses(
 
     offset, dark, bright = between(fit.offset), between(fit.low), between(fit.high)
     # something else may pass between both fits: the pilot's few rays must see the same edge
-    seen = dark + (bright - dark) * coverage(*normal, offset / footprint_px)
+    seen = dark + (bright - dark) * halfplane_share(*normal, offset / footprint_px)
     differs = np.abs(pilot[now, pixel[one]] - seen) > _PILOT * (bright - dark)
     differs |= barred[now, pixel[one]]
     fails = np.bincount(segment, differs, minlength=first.size) > 0
     keep = ~fails[segment]
-    share = dark + (bright - dark) * coverage(*normal, offset)
+    share = dark + (bright - dark) * halfplane_share(*normal, offset)
     ends = [
-        fit.low[k] + (fit.high[k] - fit.low[k]) * coverage(fit.normal_x[k], fit.normal_y[k], fit.offset[k])
+        fit.low[k] + (fit.high[k] - fit.low[k]) * halfplane_share(fit.normal_x[k], fit.normal_y[k], fit.offset[k])
         for k in (one, other)
     ]
     model = share - (ends[0] + part * (ends[1] - ends[0]))
@@ -170,7 +170,7 @@ def _slope(fit: EdgeFit, which: NDArray[np.int64], other: NDArray[np.int64] | No
         length = np.maximum(np.hypot(x, y), 1e-6)
         x, y = x / length, y / length
     step = 0.01
-    return (coverage(x, y, offset + step) - coverage(x, y, offset - step)) / (2 * step)
+    return (halfplane_share(x, y, offset + step) - halfplane_share(x, y, offset - step)) / (2 * step)
 
 
 def _part(

@@ -72,7 +72,7 @@ class PairEdges:
     def mean(self) -> NDArray[np.float64]:
         """Mean of the model over the pixel, e⁻/s on the optical axis."""
         low, high = self.low.astype(np.float64), self.high.astype(np.float64)
-        return low + (high - low) * coverage(self.normal_x, self.normal_y, self.offset)
+        return low + (high - low) * halfplane_share(self.normal_x, self.normal_y, self.offset)
 
 
 def astuple_of(values: PairEdges | EdgeFit) -> tuple[NDArray, ...]:
@@ -80,7 +80,7 @@ def astuple_of(values: PairEdges | EdgeFit) -> tuple[NDArray, ...]:
     return tuple(getattr(values, each.name) for each in fields(values))
 
 
-def coverage(
+def halfplane_share(
     normal_x: NDArray[np.floating], normal_y: NDArray[np.floating], offset: NDArray[np.floating]
 ) -> NDArray[np.float64]:
     """Share of the square [-½, ½]² in which normal · place + offset > 0, for unit normals.

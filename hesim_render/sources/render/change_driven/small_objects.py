@@ -51,7 +51,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Outline:
+class SweptOutline:
     """Convex outline of the area that an object sweeps within a window, on the full sensor.
 
     Parameters
@@ -112,11 +112,11 @@ class Zoom:
         self._aim_margin_px = 0.5**0.5 + blur_px
         self._aim_px = tuning.aim_px if can_aim else 0.0
 
-    def _outlines_in(self, begin_us: float, end_us: float) -> list[tuple[list[Outline], int, bool]]:
+    def _outlines_in(self, begin_us: float, end_us: float) -> list[tuple[list[SweptOutline], int, bool]]:
         """Outlines in one window, the number of pilot rays of a pixel inside any of them, and whether they are
         small.
         """
-        by_size: dict[bool, list[tuple[float, Outline]]] = {True: [], False: []}
+        by_size: dict[bool, list[tuple[float, SweptOutline]]] = {True: [], False: []}
         margin, tuning = self._tuning.zoom_margin_px, self._tuning
         for number, group in enumerate(self._groups):
             outline = self._outline(number, group, begin_us, end_us)
@@ -139,7 +139,7 @@ class Zoom:
                 looks.append(([outline for _, outline in entries[:some]], rays, is_small))
         return looks
 
-    def _outline(self, number: int, group: Group, begin_us: float, end_us: float) -> Outline | None:
+    def _outline(self, number: int, group: Group, begin_us: float, end_us: float) -> SweptOutline | None:
         """The area that an object sweeps; None outside the view."""
         points, extents, wider = [], [], 0.0
         if self._camera is None:
@@ -163,7 +163,7 @@ class Zoom:
             sides = np.empty((0, 3))
         extent = np.concatenate(extents)
         is_small = bool(extent.min() <= self._tuning.small_px)
-        return Outline(low, high, sides, is_small, number if extent.max() <= self._aim_px else None)
+        return SweptOutline(low, high, sides, is_small, number if extent.max() <= self._aim_px else None)
 
     def _along_edges(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
         """Corners [k, n, 3], and points between each two of a box where the lens images straight edges as curves."""
@@ -213,7 +213,7 @@ class Zoom:
         return chosen
 
     def _looks(
-        self, outlines: list[Outline], rays: int, is_small: bool, places: NDArray[np.int64], top: int, left: int
+        self, outlines: list[SweptOutline], rays: int, is_small: bool, places: NDArray[np.int64], top: int, left: int
     ) -> Iterator[Look]:
         """Looks at the pixels inside any outline.
 
@@ -248,7 +248,7 @@ class Zoom:
                 yield Look(place[at], count, is_small, (site[listed], target[listed]))
 
     def _image(
-        self, outline: Outline, top: int, left: int, shape: tuple[int, ...], margin_px: float
+        self, outline: SweptOutline, top: int, left: int, shape: tuple[int, ...], margin_px: float
     ) -> tuple[NDArray[np.bool_], tuple[slice, slice]]:
         """Pixels inside an outline, in a part of a rectangle that begins at row `top` and column `left`."""
         low = np.maximum(np.floor(outline.low - margin_px).astype(np.int64) - [left, top], 0)

@@ -30,7 +30,7 @@ from hesim_render.sources.render.scene.paint import Paint
 from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.sources.render.scene.pictures import picture_texture
 from hesim_render.sources.render.scene.scene_spectra import check_coverage, target_pieces
-from hesim_render.sources.render.scene.surfaces import area_emitter, is_diffuse, paint_of, radiance_of, surface_of
+from hesim_render.sources.render.scene.surfaces import area_emitter, bsdf_of, is_diffuse, paint_of, radiance_of
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals
 from hesim_render.specs.geometry import rotation_about
@@ -211,7 +211,7 @@ def _describe(
                 paints.append(Paint(name, (piece.reflectance,)))
     for number, item in enumerate(spec.objects):
         name = f"object_{number}"
-        placement, bsdf = _placement(item), surface_of(mi, item, spec)
+        placement, bsdf = _placement(item), bsdf_of(mi, item, spec)
         if item.shape == "mesh":
             anywhere = spec.allow_outside or spec.file is None
             parts, deformation = mesh_shapes(mi, item, name, placement, bsdf, spec.folder, anywhere)

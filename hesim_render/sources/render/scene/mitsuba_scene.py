@@ -15,7 +15,7 @@ from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.files import require_short_number
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, box_corners, transform
-from hesim_render.sources.render.scene.parsed_scene import load_scene, switch_off
+from hesim_render.sources.render.scene.parsed_scene import load_mitsuba_scene, switch_off
 from hesim_render.sources.render.scene.plugin_tables import require_known
 from hesim_render.sources.render.scene.plugins import (
     Used,
@@ -79,9 +79,9 @@ def load_mitsuba(mi: MitsubaModule, spec: SceneSpec, source: MitsubaSpec) -> Mit
     def load(review: Callable[[Any], None]) -> MitsubaObject:
         with as_spec_error(*where):
             if source.file is not None:
-                return load_scene(mi, path, review, root)
+                return load_mitsuba_scene(mi, path, review, root)
             own = mi.cornell_box() if source.builtin else _plugin_dict(mi, source.inline or {}, spec.file)
-            return load_scene(mi, {"type": "scene", **own}, review, root)
+            return load_mitsuba_scene(mi, {"type": "scene", **own}, review, root)
 
     moving = [track.object for track in spec.motion]
     reason: str | None = None

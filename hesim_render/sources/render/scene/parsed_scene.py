@@ -13,7 +13,7 @@ from hesim_render.sources.render.scene.mitsuba_version import plugin_folder, set
 from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals
 
 
-def load_scene(
+def load_mitsuba_scene(
     mi: MitsubaModule, source: Path | dict[str, Any], review: Callable[[Any], None], root: Path | None = None
 ) -> MitsubaObject:
     """Load a scene from an XML file or a dictionary, without merging shapes.

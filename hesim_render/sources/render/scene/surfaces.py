@@ -47,7 +47,7 @@ def area_emitter(radiance: Spectrum | None) -> dict[str, Any] | None:
     return None if radiance is None else {"type": "area", "radiance": spectrum_dict(radiance)}
 
 
-def surface_of(mi: MitsubaModule, item: ObjectSpec, spec: SceneSpec) -> Any:
+def bsdf_of(mi: MitsubaModule, item: ObjectSpec, spec: SceneSpec) -> Any:
     """BSDF of an object, or its dictionary for Mitsuba. Open shapes that reflect only do so on both sides.
 
     Parameters
