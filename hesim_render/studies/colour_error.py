@@ -103,7 +103,8 @@ def fit_matrix(
     >>> from hesim_render.spectral import spectrum as spectra
     >>> from hesim_render.studies import colour_samples, fit_matrix
     >>> responses = list(hr.load_sensor("reference-bayer").responses.values())
-    >>> samples = colour_samples(responses, spectra.illuminant("D65"), list(spectra.colorchecker().values()))
+    >>> surfaces = list(spectra.colorchecker_reflectances().values())
+    >>> samples = colour_samples(responses, spectra.illuminant("D65"), surfaces)
     >>> fit_matrix(samples).mean < fit_matrix(samples, "least_squares_xyz").mean < 1.5
     True
 

@@ -54,7 +54,8 @@ def colour_samples(
     >>> from hesim_render.spectral import spectrum as spectra
     >>> from hesim_render.studies import colour_samples
     >>> responses = list(hr.load_sensor("reference-bayer").responses.values())
-    >>> samples = colour_samples(responses, spectra.illuminant("D65"), list(spectra.colorchecker().values()))
+    >>> surfaces = list(spectra.colorchecker_reflectances().values())
+    >>> samples = colour_samples(responses, spectra.illuminant("D65"), surfaces)
     >>> samples.camera.shape, samples.xyz.shape, samples.white_xyz.round(3).tolist()
     ((24, 3), (24, 3), [0.95, 1.0, 1.089])
 
