@@ -15,8 +15,34 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Halves
 from hesim_render.core.distinct import distinct_pixels
+from hesim_render.core.errors import RangeError
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.protocol import FluxSource, Sample
+
+
+def checked_windows(
+    pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike, count: int
+) -> tuple[NDArray[np.uint32], NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels and the ends of their intervals as arrays.
+
+    Parameters
+    ----------
+    pixel : [n], mosaic indices.
+    begin_us, end_us : [n] or one for all, µs.
+    count : pixels of the region.
+
+    Raises
+    ------
+    RangeError
+        If a pixel lies outside the region or an interval ends before it begins.
+    """
+    pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
+    if pixels.size and pixels.max() >= count:
+        raise RangeError("pixel", int(pixels.max()), f"0 to {count - 1}")
+    begin, end = (np.asarray(value, dtype=np.float64) for value in (begin_us, end_us))
+    if not np.all(end >= begin):
+        raise RangeError("interval", "an end before its begin", "begin_us <= end_us")
+    return pixels, begin, end
 
 
 class WindowByWindow(ABC):

@@ -7,6 +7,7 @@ from math import atan, degrees
 from typing import Any
 
 import numpy as np
+from mitsuba_reference import using_variant
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.device_types import MitsubaModule
@@ -17,7 +18,7 @@ from hesim_render.sources.render.camera import MITSUBA_AXES, View, place_camera
 from hesim_render.sources.render.exact import used_responses
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.scene.builder import build
-from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict, transform, using_variant
+from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict, transform
 from hesim_render.sources.render.scene.parents import camera_trajectory
 from hesim_render.sources.scene import Scene
 

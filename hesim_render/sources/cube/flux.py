@@ -18,7 +18,7 @@ from hesim_render.core.tables import table
 from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W, US_PER_S
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.cube.planes import integrated, integration_weights
-from hesim_render.sources.still import WindowByWindow
+from hesim_render.sources.still import WindowByWindow, checked_windows
 from hesim_render.specs.files import Strict
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectral.spectrum import photopic, product, scale_to_lux
@@ -145,16 +145,10 @@ class CubeFlux(WindowByWindow):
         import drjit as dr
 
         types = jit()
-        pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
+        pixels, begin, end = checked_windows(pixel, begin_us, end_us, self.sensor.rows * self.sensor.cols)
         if pixels.size == 0:
             nothing = dr.zeros(types.Float, 0)
             return nothing, nothing
-        count = self.sensor.rows * self.sensor.cols
-        if pixels.max() >= count:
-            raise RangeError("pixel", int(pixels.max()), f"0 to {count - 1}")
-        begin, end = (np.asarray(value, dtype=np.float64) for value in (begin_us, end_us))
-        if not np.all(end >= begin):
-            raise RangeError("interval", "an end before its begin", "begin_us <= end_us")
         index = types.UInt32(pixels)
         if self.is_static:
             total = self._at(index, dr.zeros(types.Float, 1))

@@ -15,7 +15,7 @@ from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.progress import Progress
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.renderer import Demand, Renderer, Untraced
-from hesim_render.sources.still import WindowByWindow
+from hesim_render.sources.still import WindowByWindow, checked_windows
 from hesim_render.sources.video.arrays import ArrayVideo
 from hesim_render.sources.video.clock import Clock, picture_weights
 from hesim_render.sources.video.colours import to_linear_srgb
@@ -189,14 +189,11 @@ class VideoFlux(WindowByWindow, Untraced):
         import drjit as dr
 
         types = jit()
-        pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
+        pixels, begin, end = checked_windows(pixel, begin_us, end_us, self.sensor.rows * self.sensor.cols)
         if pixels.size == 0:
             nothing = dr.zeros(types.Float, 0)
             return nothing, nothing
-        count = self.sensor.rows * self.sensor.cols
-        if pixels.max() >= count:
-            raise RangeError("pixel", int(pixels.max()), f"0 to {count - 1}")
-        begin, end = _intervals(begin_us, end_us)
+        begin, end = _common(begin, end)
         index = types.UInt32(pixels)
         total: Float = 0.0
         for number, share in picture_weights(self._edges, self._is_held, begin, end).items():
@@ -298,11 +295,8 @@ class VideoFlux(WindowByWindow, Untraced):
         self._reader.close()
 
 
-def _intervals(begin_us: ArrayLike, end_us: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Both ends as float64, scalars where they are the same for all pixels."""
-    begin, end = (np.asarray(value, dtype=np.float64) for value in (begin_us, end_us))
-    if not np.all(end >= begin):
-        raise RangeError("interval", "an end before its begin", "begin_us <= end_us")
+def _common(begin: NDArray[np.float64], end: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Both ends of intervals, scalars where they are the same for all pixels."""
     if begin.ndim or end.ndim:
         ends = (begin.min(), begin.max(), end.min(), end.max())
         if ends[0] == ends[1] and ends[2] == ends[3]:

@@ -79,31 +79,6 @@ def files_readable() -> Iterator[None]:
 
 
 @contextmanager
-def using_variant(name: str | None) -> Iterator[MitsubaModule]:
-    """The mitsuba module, temporarily in another variant (``scalar_spectral``); None keeps the variant of the backend.
-
-    Raises
-    ------
-    SpecError
-        If this build of Mitsuba lacks the variant.
-    """
-    mi = mitsuba()
-    if name is None or name == mi.variant():
-        yield mi
-        return
-    if name not in mi.variants() or "spectral" not in name:
-        spectral = ", ".join(v for v in mi.variants() if "spectral" in v)
-        raise SpecError(f"no spectral Mitsuba variant {name!r}; this build has {spectral}")
-    before = mi.variant()
-    mi.set_variant(name)
-    mi.set_log_level(mi.LogLevel.Error)
-    try:
-        yield mi
-    finally:
-        mi.set_variant(before)
-
-
-@contextmanager
 def as_spec_error(file: str | Path | None, key: str | None = None) -> Iterator[None]:
     """Turn an exception of Mitsuba's loader into a `SpecError` of one line."""
     try:
