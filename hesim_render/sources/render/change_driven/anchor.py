@@ -70,11 +70,13 @@ class Anchor:
         out : [w, n], where the flux is put.
         """
         renderer, band, chosen = self._renderer, self._band, what.differences
+        # [window, pixel]
         todo = what.rendered & (chosen.rays > 0)
         if first is not None:
             todo[0] = False
         before, last = renderer.tracer.rays_done, todo.shape[0] - 1
         number = np.arange(todo.shape[0])[:, None]
+        # ends of the block are compared with the anchor, the windows between them with the first window
         for is_inner in (False, True):
             some = todo & (((number > 0) & (number < last)) == is_inner)
             window, place = np.nonzero(some)
@@ -85,12 +87,14 @@ class Anchor:
             if is_inner:
                 assert first is not None
                 # the same rays of a pixel in the first window serve all others
+                # all inner windows of a pixel have one number of rays, so any of them tells it
                 pixel, own = np.unique(place, return_index=True)
                 of = band.index[pixel], np.zeros(pixel.size, np.int64), windows, rays[own], controlled[own]
                 then = renderer.tracer.trace(*of, signed=True).at(np.searchsorted(pixel, place))
                 base = first.at(place)
             else:
                 then, base = self._means_of(place, rays, controlled), self._flux_of(place)
+            # the flux of the window that was compared with, and the difference of the same rays, for each half apart
             halves = [
                 own[0] + (new - old)
                 for own, new, old in zip(
@@ -98,6 +102,7 @@ class Anchor:
                 )
             ]
             got = PairFlux(halves[0], halves[1], now.met)
+            # a difference may be larger than the flux itself where both are near zero
             not_negative(got)
             out.half_a[some], out.half_b[some] = got.half_a, got.half_b
             out.error[some] = np.hypot(base.error[0], chosen.error[some])
@@ -109,7 +114,9 @@ class Anchor:
         rays = np.where(todo, what.differences.rays, 0).astype(np.int64)
         is_at_end = np.zeros(todo.shape[0], np.bool_)
         is_at_end[[0, -1]] = True
+        # each pair once, and of the inner windows of a pixel the rays in the first window once
         own = int(rays.sum() + rays[~is_at_end].max(axis=0, initial=0).sum())
+        # pixels whose flux in the anchor is needed
         compared = (rays[is_at_end] > 0).any(axis=0)
         flux = int(self._own_plan().rays[0][compared].sum(dtype=np.int64))
         return own, int(rays[is_at_end].sum()), flux
@@ -126,6 +133,7 @@ class Anchor:
         """Flux of some pixels in the anchor, [1, n]."""
         new = np.zeros(self._band.place.size, np.bool_)
         new[place] = True
+        # only pixels that no earlier block has asked for
         new &= ~self._is_known
         if new.any():
             renderer, band = self._renderer, self._band
@@ -145,6 +153,7 @@ class Anchor:
         for count, is_controlled in {
             (int(n), bool(by)) for n, by in zip(*np.unique([rays, controlled], axis=1), strict=True)
         }:
+            # means by number of rays and estimator are kept: later blocks compare with the same anchor
             values, is_known = self._means.setdefault(
                 (count, is_controlled), (PairFlux.empty(size), np.zeros(size, np.bool_))
             )

@@ -80,17 +80,23 @@ def difference_of(
     square = (np.where(controlled, change.controlled_scatter[window], change.plain_scatter[window]) * _SMALLER) ** 2
     scatter = np.sqrt(np.float32(0.5) * (square[here] + sites.mean(square))) / _SMALLER
     # What these rays can not have seen: a small part of the light that changed, the larger the fewer rays looked.
+    # a listed pixel with neighbours was looked at by the rays of 3 × 3 pixels
     looked = tuning.lone_pilot_rays if sites.shape is None else 9 * tuning.pilot_rays
     open_flux = pilot.unshadowed[window][here]
     scatter = np.hypot(scatter, np.float32(tuning.unseen_change / looked**0.5) * open_flux)
+    # the error of the other window comes on top of it
     wanted_error = np.float32(tuning.difference_part * quality) * units[here]
+    # the error of m rays is factor · scatter/√m
     rays = (np.float32(tuning.difference_factor) * scatter / wanted_error) ** 2
     # An edge that has moved in a neighbour may reach into this pixel between the pilot rays.
     moved = np.where(controlled, change.controlled[window], change.plain[window])
+    # the larger of the steps up and down to a neighbour of 3 × 3
     contrast = np.maximum(sites.most(moved, 1) - moved[here], moved[here] + sites.most(-moved, 1))
+    # a share `unseen_area` of the pixel with this contrast, as an error in units of the wanted one
     per_contrast = np.float32(tuning.difference_factor * tuning.unseen_area**0.5) / wanted_error
     unseen = (per_contrast * contrast) ** 2
     brighter = np.float32(tuning.bright_rays) * sites.most(np.abs(moved), 2) / units[here]
+    # what was not seen may ask for a limited number of rays only
     rays = np.maximum(rays, np.minimum(np.maximum(unseen, brighter), np.float32(tuning.most_unseen_rays)))
     if pilot.all_move:
         # Every edge moves, even by less than the distance of two pilot rays, and may come into this pixel.
@@ -123,14 +129,17 @@ def differences(
     change = pilot.change
     if change is None:
         return out
+    # the windows that are compared with the first one
     inner = slice(1, max(1, last))
     steadier = change.controlled_scatter <= change.plain_scatter
     # those windows share rays in the first one, and so the estimator
     steadier[inner] = change.controlled_scatter[inner].sum(axis=0) <= change.plain_scatter[inner].sum(axis=0)
     for window, controlled in enumerate(steadier):
         wanted, scatter = difference_of(pilot, window, controlled, sites, units[window], quality, tuning)
+        # to the nearest power of two, so that stratified sequences are used whole
         bits = np.rint(np.log2(np.minimum(wanted, tuning.most_rays))).astype(np.int16)
         rays = np.left_shift(np.int16(1), bits)
+        # the other window is rendered as well, so that a difference has to be several times cheaper
         pays = rendered[window] & (np.float32(tuning.difference_gain) * rays <= alone[window])
         out.rays[window] = np.where(pays, rays, 0)
         out.controlled[window], out.error[window] = controlled[sites.listed], scatter
@@ -140,13 +149,16 @@ def differences(
         looked_at[refined.place] = True
         out.rays[window, looked_at[sites.listed]] = 0
     if pilot.aims is not None:
+        # pairs with small objects in them have rays aimed at these, which a difference has not
         which, place = np.nonzero(out.rays)
         is_aimed = pilot.aims.at(which, sites.listed[place]).count > 0
         out.rays[which[is_aimed], place[is_aimed]] = 0
     # all windows between take as many rays as the one that needs most, and together pay for those in the first window
     own = out.rays[inner]
     most = own.max(axis=0, initial=0)
+    # rays that all inner windows of a pixel save together, [pixel], against `most` rays once more in the first window
     saved = np.where(own > 0, alone[inner].astype(np.int32) - most, 0).sum(axis=0)
     own[:] = np.where((own > 0) & (saved > most), most, 0)
+    # from the scatter of single differences to the error of their mean
     out.error[:] *= np.float32(tuning.difference_factor) / np.sqrt(np.maximum(out.rays, 1).astype(np.float32))
     return out

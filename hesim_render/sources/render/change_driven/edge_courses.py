@@ -38,14 +38,17 @@ def fitted_windows(worth: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """
     fitted = np.zeros(worth.shape, np.bool_)
     pixels = np.arange(worth.shape[1])
+    # of each pixel: the last window in which a fit would pay, and its number in the run of such windows
     last, rank = np.full(pixels.size, -_FAR - 1), np.zeros(pixels.size, np.int64)
     for window, here in enumerate(worth):
+        # a run of windows begins where the last one is far; the run before it, if there was one, ends with a fit
         starts = here & (window - last > _FAR)
         ends = starts & (last >= 0)
         fitted[last[ends], pixels[ends]] = True
         rank = np.where(starts, 0, rank + here)
         fitted[window] = here & (rank % _STRIDE == 0)
         last[here] = window
+    # the last run of each pixel ends with its last window
     some = last >= 0
     fitted[last[some], pixels[some]] = True
     return fitted
@@ -107,20 +110,25 @@ def courses(
     barred : [window, pixel], pairs over which no edge is followed.
     """
     # neighbours in time: both fits of a pixel, one after the other
+    # [k], by pixel, then by window
     order = np.lexsort((window, pixel))
     first, second = order[:-1], order[1:]
+    # [pairs of fits]
     both = (pixel[first] == pixel[second]) & (window[second] - window[first] <= _LONGEST)
     both &= fit.is_edge[first] & fit.is_edge[second]
     first, second = first[both], second[both]
     # one edge: nearly the same direction and levels on both sides
+    # of the weaker of both fits, e⁻/s
     contrast = np.minimum(fit.high[first] - fit.low[first], fit.high[second] - fit.low[second])
     turn = _angle(fit, second) - _angle(fit, first)
+    # the shorter way round
     turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
     same = np.abs(turn) <= _TURN
     for level in (fit.low, fit.high):
         same &= np.abs(level[second] - level[first]) <= _LEVEL * contrast
     # what the gaps leave open is the same at both ends, but for the bend of the share between them
     slopes = np.stack([_slope(fit, first), _slope(fit, second), _slope(fit, first, second)])
+    # half of the mean width of both gaps, px: the line may lie anywhere in its gap
     gaps = 0.25 * (fit.gap[first] + fit.gap[second])
     same &= contrast * gaps * np.ptp(slopes, axis=0) <= _BEND * np.minimum(wanted[first], wanted[second])
     first, second, turn = first[same], second[same], turn[same]
@@ -128,11 +136,13 @@ def courses(
         return Courses.none()
     # every window between both
     count = window[second] - window[first] - 1
+    # [windows between]: number of the pair of fits, and place of the window between both
     segment = np.repeat(np.arange(first.size), count)
     within = np.arange(segment.size) - np.repeat(np.cumsum(count) - count, count)
     one, other = first[segment], second[segment]
     now = window[one] + 1 + within
     part = _part(now, window[one], window[other], centre_us)
+    # directions are interpolated as angles, since a mean of normals would turn unevenly
     angle = _angle(fit, one) + part * turn[segment]
     normal = np.cos(angle), np.sin(angle)
 
@@ -144,9 +154,11 @@ def courses(
     seen = dark + (bright - dark) * halfplane_share(*normal, offset / footprint_px)
     differs = np.abs(pilot[now, pixel[one]] - seen) > _PILOT * (bright - dark)
     differs |= barred[now, pixel[one]]
+    # one window that differs ends the whole segment: the edge is not the same all along
     fails = np.bincount(segment, differs, minlength=first.size) > 0
     keep = ~fails[segment]
     share = dark + (bright - dark) * halfplane_share(*normal, offset)
+    # the same model in both windows of fits, of which the interpolation is subtracted
     ends = [
         fit.low[k] + (fit.high[k] - fit.low[k]) * halfplane_share(fit.normal_x[k], fit.normal_y[k], fit.offset[k])
         for k in (one, other)
@@ -167,6 +179,7 @@ def _slope(fit: EdgeFit, which: NDArray[np.int64], other: NDArray[np.int64] | No
     if other is not None:
         others = fit.normal_x[other], fit.normal_y[other], fit.offset[other]
         x, y, offset = (0.5 * (a + b) for a, b in zip((x, y, offset), others, strict=True))
+        # a mean of two unit normals is shorter than one
         length = np.maximum(np.hypot(x, y), 1e-6)
         x, y = x / length, y / length
     step = 0.01

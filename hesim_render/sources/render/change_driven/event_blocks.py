@@ -42,8 +42,10 @@ class Blocks:
         self._renderer = renderer
         self.base = Flux.zeros(1, pixel.size)
         span_us = anchor_us(first.begin_us, first.end_us)
+        # the anchor of the first window at all pixels: constant pixels keep this flux for the whole run
         begin, end = (np.full(pixel.size, time) for time in span_us)
         renderer.alone(pixel, begin, end, "events", self.base)
+        # values of the anchor are no samples of the sensor
         renderer.counts.values -= pixel.size
         self.alive = np.flatnonzero(~renderer.still("events").known[pixel])
         self._bands = list(renderer.bands(pixel[self.alive], "events"))
@@ -56,11 +58,14 @@ class Blocks:
     def take(self, block: Block) -> BlockFlux:
         """Flux of the pixels that may change."""
         renderer, windows = self._renderer, Windows(block.begin_us, block.end_us)
+        # the block begins with the window that ended the one before, whose flux is known
         is_next = self._time == (block.begin_us[0], block.end_us[0])
         parts: list[tuple[NDArray[np.int64], Knots]] = []
+        # interpolation runs between the middles of windows
         centre = 0.5 * (block.begin_us + block.end_us)
         span_us = anchor_us(block.begin_us, block.end_us)
         for number, band in enumerate(self._bands):
+            # a new anchor every 64 ms; the old one is no longer compared with
             if self._anchors[number].span_us != span_us:
                 self._anchors[number] = Anchor(renderer, band, span_us)
             anchor = self._anchors[number]
@@ -70,16 +75,20 @@ class Blocks:
                 continue
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
             pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride)
+            # what lies behind the last wanted window, at the end of a run, is not rendered
             what = renderer.plan(pilot, band, is_knot=True).until(int(np.flatnonzero(block.wanted)[-1]))
             numbers = np.repeat(np.arange(windows.size)[:, None], band.place.size, axis=1)
             if first is None:
                 # by itself, so that the other windows are traced by the calls of a run that comes from the block before
                 first = renderer.render(band, windows, numbers[:1], what.first())[0]
                 anchor.render(windows, what.first(), None, first)
+            # windows between two fits of one edge drop out of the plan
             what, fit, followed = renderer.follow(band, windows, numbers, what)
             flux, _ = renderer.render(band, windows, numbers, what, first=first, fit=fit)
+            # differences are put beside the pairs that were rendered by themselves
             anchor.render(windows, what, first, flux)
             followed.fill(flux, centre)
+            # knots are windows that were rendered, and those that an edge was followed through
             known = what.rendered.copy()
             known[followed.window, followed.pixel] = True
             parts.append((band.place, Knots.of(flux, known, centre)))
@@ -111,6 +120,7 @@ class Knots:
     @classmethod
     def of(cls, flux: Flux, known: NDArray[np.bool_], centre_us: NDArray[np.float64]) -> Knots:
         """The known windows [window, pixel] of some pixels; the first window is among them."""
+        # in order of pixel, then of window
         pixel, window = np.nonzero(known.T)
         first = np.append(0, np.cumsum(np.count_nonzero(known, axis=0)))
         values = tuple(values[window, pixel] for values in flux.arrays)
@@ -125,6 +135,7 @@ class Knots:
         before : the same of the window before it, if it is known.
         """
         if before is not None:
+            # a pixel moves on by one knot where the next one is reached; the last knot of all has no next one
             following = np.minimum(before + 1, self.window.size - 1)
             moves = (before + 1 < self.first[1:]) & (self.window[following] <= window)
             return before + moves

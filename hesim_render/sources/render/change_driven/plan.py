@@ -33,12 +33,15 @@ def changes(flux: NDArray[np.float32], least: NDArray[np.float32]) -> NDArray[np
     Marks, [window, site].
     """
     marked = np.zeros(flux.shape, np.bool_)
+    # the flux of the last marked window of each site, [site]; windows are compared with it, so that slow drifts add up
     level = flux[0].copy()
     for window in range(1, flux.shape[0]):
         now = flux[window]
+        # the noise is that of either window, and the smaller one decides what can be seen
         bound = np.minimum(least[window - 1], least[window])
         changed = np.abs(now - level) > bound
         marked[window] |= changed
+        # a sudden step: the line to the marked window would begin too early without the window before it
         marked[window - 1] |= changed & (np.abs(now - flux[window - 1]) > np.float32(0.5) * bound)
         np.copyto(level, now, where=changed)
     return marked
@@ -143,6 +146,7 @@ def plan(
     """
     count, last = pilot.windows, pilot.windows - 1
     shape = count, sites.listed.size
+    # noise units of all sites, [window, site]; the pilot has neighbours besides the listed pixels
     units = np.stack([unit(pilot.flux_of(window)) for window in range(count)])
     out = Plan(
         np.ones(shape, np.bool_),
@@ -158,10 +162,13 @@ def plan(
         pilot.aims,
     )
     if last > 1:
+        # what must change, at least, for a window to be rendered, [window, site]
         flux, least = pilot.steady_flux, np.float32(tuning.change * tuning.tolerance * quality) * units
         marked = changes(flux, least)
+        # a large change of a neighbour may reach a pixel, and an extreme one more pixels and windows away
         large = changes(flux, np.float32(tuning.large_change) * least)
         extreme = longer(changes(flux, np.float32(tuning.extreme_change) * least), tuning.extreme_windows)
+        # the first and the last window are rendered anyway, as the ends of all interpolation
         for window in range(1, last):
             near = sites.most(large[window], 1) | sites.most(extreme[window], 2)
             out.rendered[window] = marked[window][sites.listed] | near
@@ -172,12 +179,15 @@ def plan(
                 looked_at[window, refined.place] = True
             out.barred[:] = longer(looked_at, 1)[:, sites.listed]
             out.rendered[1:last] |= out.barred[1:last]
+    # rays, estimator and expected error of every pair; many windows are interpolated from the ends of a block
     for window in range(count):
         at_end = is_knot and window in (0, last)
         part = allocate(pilot, window, sites, units, quality, gain, tuning, at_end)
         out.rays[window], out.controlled[window], out.error[window], out.floor[window] = part
+    # where little changes, few rays of a difference do what many rays of the pair alone would
     chosen = differences(pilot, sites, units, quality, out.rendered, out.rays, tuning)
     if follows and last > 1:
+        # a fit of a line takes decision rays of its own, which must be few against those of the pair
         worth = out.rendered & (out.rays >= tuning.edge_least_rays) & (chosen.rays == 0) & ~out.barred
         out.fitted[:] = fitted_windows(worth)
     return replace(out, differences=chosen)
