@@ -69,14 +69,17 @@ def row_noise(dark: FrameMoments, used: NDArray[np.bool_]) -> Shared:
     exposures = range(dark.exposures_us.size)
     parts = [_row_changes(dark, k, used) for k in exposures]
     own = np.maximum([noise[rows] for _, noise in parts], _LEAST_NOISE_DN2)
+    # variance of each row's mean over the frames, with the mean over rows taken out, [exposure, row]
     result = np.stack([np.sum(change[:, rows] ** 2, axis=0) for change, _ in parts]) / (dark.frames - 1)
     result *= count / (count - 1)
     # a row with a flickering pixel has less information; weights from the rows' own samples would bias the sum
     weight = 1 / np.maximum(own, _BUSY * np.median(own, axis=1)[:, None]) ** 2
     level, total = weight * own, float(np.sum(weight * own))
     ratio = float(np.sum(weight * result)) / total
+    # effective number of squares in a weighted sum of them
     freedom = total**2 / float(np.sum(level**2)) * (dark.frames - 1) * (count - 1) / count
     behind = (dark.frames - 1) * float(used.sum()) * len(exposures)
+    # mean of the pixels' own part, DN², by which the ratio becomes a variance
     scale = total / float(weight.sum())
     error = scale * ratio * float(np.sqrt(2 / freedom))
     return Shared(scale * (ratio - 1), error, ratio, float(f_law.sf(ratio, freedom, behind)))
@@ -99,6 +102,7 @@ def without_rows(moments: FrameMoments, used: NDArray[np.bool_], full_scale_dn: 
     for k in range(moments.exposures_us.size):
         change, noise = _row_changes(moments, k, used)
         saturated = (moments.lowest[k] >= full_scale_dn) | (moments.highest[k] == 0)
+        # part of the row's pixels that are not clipped
         clear = np.sum(~saturated & used, axis=1) / np.maximum(used.sum(axis=1), 1)
         own = (np.sum(change**2, axis=0) / (moments.frames - 1) - noise) / np.maximum(clear, _LEAST_CLEAR) ** 2
         own += typical / change.shape[1]  # what the frame's mean took of it
@@ -125,6 +129,7 @@ def _row_changes(
     """
     rows = used.any(axis=1)
     change = moments.row_means[k] - moments.row_means[k].mean(axis=0)
+    # the change of the whole frame is drift, and no row noise
     change = change - change[:, rows].mean(axis=1)[:, None]
     total = np.sum(np.where(used, moments.variance[k], 0.0), axis=1, dtype=np.float64)
     pixels = np.maximum(used.sum(axis=1), 2)
@@ -169,6 +174,7 @@ def frame_drift(moments: FrameMoments, k: int, row_variance: float, signal_dn: N
     signal_dn : [row, col], light above black, DN; None in the dark.
     """
     halves = [moments.half[k] == side for side in (0, 1)]
+    # [half]; the variance of their means by the pixels' own noise
     pixels = np.array([max(int(mask.sum()), 1) for mask in halves])
     own = np.array([float(np.sum(moments.variance[k][m], dtype=np.float64)) for m in halves]) / pixels**2
     # the halves may lie in different rows: row noise does not cancel in their difference
@@ -185,6 +191,7 @@ def frame_drift(moments: FrameMoments, k: int, row_variance: float, signal_dn: N
     alone = FrameDrift(exposure, shared, None, float(np.ptp(together)), 0.0)
     if signal_dn is None:
         return alone
+    # two equations for each frame: level + light · signal of the half
     levels = [float(signal_dn[m].mean()) if m.any() else 0.0 for m in halves]
     between = levels[1] - levels[0]
     if between < _LEAST_BETWEEN * max(levels[1], 1e-9) or between <= 0:

@@ -119,6 +119,7 @@ def linearity_error(light: NDArray, signal: NDArray, top: float) -> tuple[NDArra
     if use.sum() < 3:
         return use, np.empty(0)
     x, y = light[use], signal[use]
+    # relative deviations are least: y/y = 1 is fitted by (1, x)/y
     design = np.stack([np.ones_like(x), x]) / y
     fit = np.linalg.lstsq(design.T, np.ones_like(y), rcond=None)[0]
     return use, 100 * (y / (fit[0] + fit[1] * x) - 1)
@@ -177,10 +178,12 @@ def mean_curve(light: NDArray, signal: NDArray, error_dn: NDArray) -> MeanCurve:
     is kept if the residuals fall more than chance lets them (F test at `ALARM`).
     """
     scale = float(light.max())
+    # light from 0 to 1, so that all terms are of one size
     h = light / scale
     relative = 1e-4
     free = np.array([False, True, False, False])
     for _ in range(3):
+        # the scatter of the light is found with the curve, in three rounds
         weight = 1 / np.hypot(error_dn, relative * signal)
         free = np.array([False, True, False, False])
         best, squares = _fit(h, signal, weight, free)
@@ -204,9 +207,11 @@ def mean_curve(light: NDArray, signal: NDArray, error_dn: NDArray) -> MeanCurve:
         excess = float(np.mean(residual[bright] ** 2 / signal[bright] ** 2)) * h.size / dof
         excess -= float(np.mean(error_dn[bright] ** 2 / signal[bright] ** 2))
         relative = float(np.sqrt(max(excess, 1e-12)))
+    # covariance by the linearised curve, wider where χ² shows misfit
     jacobian = _gradient(best, h)[free] * weight
     covariance = np.zeros((4, 4))
     inside = np.linalg.inv(jacobian @ jacobian.T) * max(squares / dof, 1.0)
+    # back to the unit of the light
     units = np.array([scale, 1 / scale, 1 / scale**2, 1 / scale**3])
     covariance[np.ix_(free, free)] = inside
     covariance *= np.outer(units, units)
@@ -227,6 +232,7 @@ def _gradient(p: NDArray, h: NDArray) -> NDArray[np.float64]:
 def _fit(h: NDArray, y: NDArray, weight: NDArray, free: NDArray) -> tuple[NDArray[np.float64], float]:
     """Parameters (offset, b₁, b₂, b₃) and the weighted sum of squares."""
     p = np.zeros(4)
+    # a line through the origin to begin with, then Gauss–Newton steps
     p[1] = float(np.sum(weight**2 * h * y) / np.sum(weight**2 * h * h))
     for _ in range(_STEPS):
         p[free] += np.linalg.lstsq((_gradient(p, h)[free] * weight).T, weight * (y - _value(p, h)), rcond=None)[0]

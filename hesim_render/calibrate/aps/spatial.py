@@ -90,11 +90,13 @@ def temporal_of(moments: FrameMoments) -> tuple[Temporal, NDArray[np.float64]]:
     whole = float(moments.variance[0].mean(dtype=np.float64))
     levels = moments.row_means[0].mean(axis=1)
     change = moments.row_means[0] - moments.row_means[0].mean(axis=0)
+    # without the change of the whole frame
     change = change - change.mean(axis=1)[:, None]
     of_rows = float(np.sum(change**2)) / ((frames - 1) * (rows - 1))
     # of_rows = R + σ²/cols, and the mean variance of a pixel about its own row is σ² (1 − 1/cols)
     row = of_rows - (whole - float(levels.var(ddof=1)) - of_rows) / (cols - 1)
     own = whole - max(row, 0.0)
+    # variance of the frames' levels beyond that of their pixels and rows
     frame = float(levels.var(ddof=1)) - own / (rows * cols) - max(row, 0.0) / rows
     own -= max(frame, 0.0)
     freedom = (frames - 1) * (rows - 1)
@@ -108,12 +110,14 @@ def spatial_variance(mean: NDArray, temporal: Temporal, frames: int) -> SpatialV
     the same with degrees of freedom in place of numbers, and with what rows and columns share from frame to frame.
     """
     rows, cols = mean.shape
+    # row means, column means, and the rest, in which neither has a part
     by_row, by_col = mean.mean(axis=1), mean.mean(axis=0)
     rest = mean - by_row[:, None] - by_col + mean.mean()
     freedom = (rows - 1, cols - 1, (rows - 1) * (cols - 1))
     pixel = float(np.sum(rest**2)) / freedom[2]
     noise_pixel = temporal.pixel / frames
     noise = (noise_pixel / cols + temporal.row / frames, noise_pixel / rows + temporal.col / frames, noise_pixel)
+    # row means contain the mean of their pixels, of the pattern and of noise
     row = float(by_row.var(ddof=1)) - max(pixel - noise_pixel, 0.0) / cols - noise[0]
     col = float(by_col.var(ddof=1)) - max(pixel - noise_pixel, 0.0) / rows - noise[1]
     return SpatialVariance(row, col, pixel - noise_pixel, noise, freedom)
@@ -162,11 +166,13 @@ def pattern_of(
     by_row, by_col = image.mean(axis=1) - level, image.mean(axis=0) - level
     rest = image - level - by_row[:, None] - by_col
     spread = 1.4826 * float(np.median(np.abs(rest)))
+    # single pixels that stand out would ring in a transform
     plain = np.clip(rest, -_INDIVIDUAL * spread, _INDIVIDUAL * spread)
     waves = _waves(plain, noise[2], spectrum, frames)
     rest = rest - waves
     smooth = uniform_filter(plain - waves, _BOX, mode="nearest")
     part = 1 / _BOX**2
+    # what is left of the noise when a box mean was taken out
     fine = _scaled(rest - smooth, noise[2] * (1 - part))
     power = float(np.mean(smooth**2))
     smooth *= np.sqrt(max(0.0, power - noise[2] * part) / max(power, 1e-300))
@@ -181,8 +187,11 @@ def _waves(values: NDArray, noise: float, temporal: NoiseSpectrum | None, frames
     rows, cols = values.shape
     for line in [] if temporal is None else temporal.lines:
         row, col = round(line.cycles_per_row * rows), round(line.cycles_per_col * cols)
+        # a real image has each frequency twice, but for those of half a period
         noises[[row % rows, -row % rows], [col, col if 2 * col == cols else 0]] += line.power(values.shape) / frames
+    # the median of an exponential law is ln 2 of its mean
     white = np.maximum(noises, max(float(np.median(power)) / np.log(2.0), 1e-300))
+    # the power of white noise is exponential: a share `_PEAK_CHANCE` of images has one above this
     peak = power > white * np.log(power.size / _PEAK_CHANCE)
     own = np.sqrt(np.maximum(0.0, 1 - noises / np.maximum(power, 1e-300)))
     return np.asarray(np.fft.irfft2(np.where(peak, spectrum * own, 0.0), values.shape))

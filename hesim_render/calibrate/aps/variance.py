@@ -122,11 +122,13 @@ def pool(
     else:
         low, high = float(x.min()), float(x.max())
         count = _BINS if high > low else 1
+        # bins of equal width in brightness; dark pixels make one bin
         index = np.minimum(((x - low) * (count / max(high - low, 1e-30))).astype(np.intp), count - 1)
 
     def total(values: NDArray | None) -> NDArray:
         return np.bincount(index, weights=values, minlength=count).astype(np.float64)
 
+    # sums of powers of the signal, and of their products with the sample variance, [bin, power]
     powers, products = np.empty((count, _POWERS)), np.empty((count, _PRODUCTS))
     powers[:, 0], products[:, 0], power = total(None), total(y), np.ones_like(x)
     for k in range(1, _POWERS):
@@ -135,6 +137,7 @@ def pool(
         if k < _PRODUCTS:
             products[:, k] = total(y * power)
     squares = total(y * y)
+    # bins without pixels go
     kept = powers[:, 0] > 0
     powers, products, squares = powers[kept], products[kept], squares[kept]
     size = len(squares)
@@ -193,16 +196,19 @@ def fit_variance(bins: Pooled, without: Sequence[int] = ()) -> VarianceFit:
     without : numbers of terms that are not fitted.
     """
     everything = bins.pixels.sum()
+    # rounding hides smaller variances: a sample variance then tells nothing
     seen = bins.variance_dn2 >= QUANTISED_VARIANCE_DN2
     bins = Pooled(*(getattr(bins, name)[seen] for name in Pooled.__dataclass_fields__))
     if bins.pixels.size == 0:
         nothing = np.zeros(6)
         return VarianceFit(nothing, nothing > 0, np.zeros((6, 6)), float("nan"), 0, 1.0, 1.0, None, int(everything))
+    # units in which the largest signal and the longest exposure are 1
     scale = np.array([1.0, 1.0, 1.0])
     scale[1] = max(float(np.max(np.abs(bins.signal_dn))), 1e-9)
     scale[2] = float(bins.exposure_s.max())
     units = np.prod(scale[1:] ** np.stack([_LIGHT, _TIME], axis=1), axis=1)
     equations = _normal_equations(bins, scale)
+    # terms whose error is as large as a quarter of the largest variance leave one by one
     dropped = list(without)
     limit = _USELESS * float(bins.variance_dn2[bins.pixels >= np.median(bins.pixels)].max())
     while True:
@@ -225,6 +231,7 @@ def fit_variance(bins: Pooled, without: Sequence[int] = ()) -> VarianceFit:
 
 def _p_value(bins: Pooled, chi2: float, dof: int) -> float:
     """Probability of a larger χ² of the sample variances: each square scatters by 2 + 12/(n − 1) (Gaussian noise)."""
+    # normal law of a sum of so many squares
     each = float(np.average(2 + 12 / bins.freedom, weights=bins.pixels))
     return float(ndtr(-(chi2 - 1) * np.sqrt(dof / each)))
 
@@ -245,8 +252,10 @@ def _cubic(bins: Pooled, units: NDArray, equations: tuple, solved: tuple) -> tup
     products, exact, noisy = equations
     predicted = np.maximum(polynomial(beta / units[:6], bins.signal_dn, bins.exposure_s), _FLOOR_DN2)
     weight = bins.weight(predicted + ADC_VARIANCE_DN2)
+    # the terms of the fit, and I³
     kept = np.append(np.flatnonzero(keep), 6)
     matrix, scatter = (np.tensordot(weight, m, 1)[np.ix_(kept, kept)] for m in (exact, noisy))
+    # not separable from the others: the scaled matrix is singular
     root = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     if np.linalg.eigvalsh(matrix / np.outer(root, root))[0] < _SINGULAR:
         return None
@@ -299,6 +308,7 @@ def _normal_equations(bins: Pooled, scale: NDArray) -> tuple[NDArray, NDArray, N
     power = bins.powers / scale[1] ** np.arange(_POWERS)
     product = bins.products / scale[1] ** np.arange(_PRODUCTS)
     corrected, corrected_product = _without_noise(power, tau), _without_noise(product, tau)
+    # every entry is a sum of Iᵃ tᵇ, with the exponents of both terms added
     times = t[:, None] ** np.arange(5)
     pairs = _LIGHT[:, None] + _LIGHT, _TIME[:, None] + _TIME
     factor = times[:, pairs[1]]
@@ -310,6 +320,7 @@ def _without_noise(sums: NDArray, tau: NDArray) -> NDArray[np.float64]:
     result = sums.astype(np.float64).copy()
     for n in range(2, sums.shape[1]):
         for j in range(1, n // 2 + 1):
+            # coefficients of the Hermite polynomial of degree n
             count = factorial(n) / (factorial(j) * factorial(n - 2 * j) * 2**j)
             result[:, n] += (-1) ** j * count * tau**j * sums[:, n - 2 * j]
     return result

@@ -83,13 +83,16 @@ def fit_trials(sets: Sequence[Trials], law: Law, start: NDArray, rounds: int = _
     """
     values = start.copy()
     for _ in range(2):
+        # the grid is laid about the thresholds of the round before
         on, off = (threshold_grid(values[t], values[m]) for t, m in zip(THETA, MISMATCH, strict=True))
         likelihood = Likelihood.of(sets, law, (on, off))
         values, scores, free, best = _climb(likelihood, values, rounds)
     information = scores[:, free].T @ scores[:, free]
     covariance = np.full((len(NAMES), len(NAMES)), np.nan)
+    # scores are by ln of the parameters: back to the parameters themselves
     inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
     covariance[np.ix_(free, free)] = inverse * np.outer(values[free], values[free])
+    # the law itself is approximate, which no number of trials changes
     covariance[np.diag_indices(len(NAMES))] += (_LAW_ERROR * values) ** 2
     return Fit(law, values, covariance, scores, free, likelihood, best)
 
@@ -114,6 +117,7 @@ def _climb(likelihood: Likelihood, start: NDArray, rounds: int) -> tuple[NDArray
         best, gradient = float(each.sum()), scores.sum(axis=0)
         free = np.ones(len(NAMES), bool)
         for k in _MAY_VANISH:
+            # a term at its floor stays out unless the likelihood rises with it
             free[k] = values[k] > 2 * least[k] or gradient[k] > 0
         # far from the maximum scores are large because all point one way: the curvature follows from their scatter
         centred = scores[:, free] - scores[:, free].mean(axis=0)
@@ -121,6 +125,7 @@ def _climb(likelihood: Likelihood, start: NDArray, rounds: int) -> tuple[NDArray
         ridge = 1e-9 * np.trace(information) * np.eye(int(free.sum()))
         change = np.zeros(len(NAMES))
         change[free] = np.linalg.solve(information + ridge, gradient[free])
+        # twice what the step should gain in ln L
         expected = float(gradient[free] @ change[free])
         if expected < _ENOUGH:
             break
@@ -140,6 +145,7 @@ def _along(
         there = values * np.exp(scale * change)
         there[list(_MAY_VANISH)] = np.maximum(there, least)[list(_MAY_VANISH)]
         total = float(likelihood.of_pixels(there).sum())
+        # double the step while it gains, shorten it while it does not
         if total > best:
             result, best = there, total
             if scale < 1:
@@ -201,11 +207,13 @@ def _pooled_curves(steps: Trials, polarity: int) -> list[tuple[int, float, float
     for light in np.unique(steps.signal_dn):
         kinds = np.flatnonzero((np.sign(steps.contrast) == polarity) & (steps.signal_dn == light))
         kinds = kinds[np.argsort(np.abs(steps.contrast[kinds]))]
+        # share of the calm trials of all pixels with an event in the first bin
         rate = steps.events(polarity)[kinds, 0].sum(axis=1) / np.maximum(steps.calm[kinds].sum(axis=1), 1)
         if kinds.size < 3 or rate[0] > 0.4 or rate[-1] < 0.6:
             continue
         # where even the last step lacks events, the start follows from the existing ones; the checks report it
         contrast, missing = np.abs(steps.contrast[kinds]), 1 - rate / rate[-1]
+        # mean and variance of a law from its distribution function, by integrals
         first = np.trapezoid(missing, contrast)
         second = 2 * np.trapezoid(missing * (contrast - contrast[0]), contrast)
         result.append((polarity, float(light), float(contrast[0] + first), float(max(second - first**2, 1e-8))))

@@ -88,6 +88,7 @@ def chances(values: NDArray, trials: Trials, polarity: int, thresholds: NDArray,
     events, others = first_event(
         thresholds[None, :], values[other], step, noise, values[CUTOFF], trials.settle_s, trials.edges_s, leak
     )
+    # of the trials that go on: those that the other polarity has not ended
     left = np.maximum(1.0 - others.sum(axis=0), _LEAST_CHANCE)
     return np.moveaxis(np.clip(events / left, 0.0, 1.0), 0, 1)
 
@@ -119,6 +120,7 @@ class TrialCounts:
 
     def log_likelihood(self, values: NDArray, grid: NDArray, law: Law) -> NDArray[np.float64]:
         """ln L [pixel, threshold]."""
+        # ln of the chance of each outcome, by threshold: one product of matrices for all pixels
         result = [chances(values, t, self.polarity, grid, law) for t in self.sets]
         events = np.concatenate([np.log(np.maximum(c, _LEAST_CHANCE)).reshape(-1, grid.size) for c in result])
         none = np.concatenate([np.log(np.maximum(1.0 - c.sum(axis=1), _LEAST_CHANCE)) for c in result])
@@ -245,7 +247,9 @@ def first_event(
     before, after = noise
     shape = np.broadcast_shapes(*(np.shape(v) for v in (theta, theta_other, step, before, after)))
     own, other = np.zeros((2, len(edges_s) - 1, *shape))
+    # chance of trials that are calm until the step, of which the result is the share
     total = np.zeros(shape)
+    # how much of the noise at the reset is left at the step, and the amplitude of what is new
     rho = correlation(cutoff_hz, settle_s)
     fresh = math.sqrt(max(1.0 - rho * rho, 1e-12))
     settling = max(settle_s - _REMEMBERED / cutoff_hz, 0.0)
@@ -262,14 +266,17 @@ def first_event(
         at_once = np.maximum(within - ndtr((up / after - rho * z) / fresh), 0.0) / calm
         at_once_other = np.maximum(below - ndtr((down / after + rho * z) / fresh), 0.0) / calm
         at_once, at_once_other = np.minimum(at_once, 1.0), np.minimum(at_once_other, 1.0 - np.minimum(at_once, 1.0))
+        # after the step: rates at which noise passes either threshold, with leaks; the first passage wins
         rate = cutoff_hz * passage_rate(up / after) + leak_hz[0]
         rate_other = cutoff_hz * passage_rate(down / after) + leak_hz[1]
         both = np.maximum(rate + rate_other, 1e-300)
         waiting = np.maximum(kept * (1.0 - at_once - at_once_other), 0.0)
         alive = np.exp(-np.minimum(both * np.reshape(edges_s, (-1, *[1] * len(shape))), 700.0))
+        # chance that the first passage lies in each bin, shared between both polarities by their rates
         later = waiting * (alive[:-1] - alive[1:])
         own += later * (rate / both)
         other += later * (rate_other / both)
+        # what passes with the step itself belongs to the first bin
         own[0] += kept * at_once
         other[0] += kept * at_once_other
         total += kept

@@ -57,6 +57,7 @@ def dispersion_in_time(pixels: PixelCounts, fit: EventFit, theta_v: float) -> Di
     cells = pixels.cells
     p = np.exp(log_probability(fit.parameters, cells, theta_v, fit.law)[0])
     u, _ = threshold_over_noise(fit.parameters, cells.signal_dn, theta_v, fit.law)
+    # variance of a pixel's counts that the spread of thresholds makes, [cell]
     between = cells.trials**2 * probability_variance(
         u * (1 - cells.polarity * fit.parameters[4]), cells.spread, cells.relative
     )
@@ -67,7 +68,9 @@ def dispersion_in_time(pixels: PixelCounts, fit: EventFit, theta_v: float) -> Di
         thresholds = between[pixels.cell[on]] + between[pixels.cell[off]]
         n = cells.trials
         e_on, e_off = pixels.counts[on] - n * p_on, pixels.counts[off] - n * p_off
+        # variances of ON + OFF and of ON − OFF of a trinomial law
         both, apart = n * (p_on + p_off) * (1 - p_on - p_off), n * (p_on + p_off - (p_on - p_off) ** 2)
+        # only where thresholds hide little
         clear = (thresholds < _CLEAR * both) & (both > 0)
         for column, values in zip(columns, (e_on + e_off, e_on - e_off, both, apart, thresholds), strict=True):
             column.append(values[clear])
@@ -79,6 +82,7 @@ def _ratio(residual: NDArray, counting: NDArray, thresholds: NDArray) -> tuple[f
     """(Σ residual² − thresholds)/counting with weights of a variance's own scatter, and its standard error."""
     if residual.size < 100:
         return float("nan"), float("nan")
+    # the square of the residual of a Poisson count, over its mean, has a variance of 2 + 1/mean
     weight = 1 / (2 + 1 / counting)
     values = (residual**2 - thresholds) / counting
     mean = float(weight @ values / weight.sum())
@@ -95,6 +99,7 @@ def static_mismatch(pixels: PixelCounts, typical: Typical) -> Spread:
     mixture = _Mixture.of(pixels, typical)
     if mixture.pixel.size < _FEWEST_COUNTS:
         return Spread(0.0, float("nan"), float("nan"))
+    # against the likelihood without any mismatch
     top, m, scale = mixture.maximum(float(np.clip(typical.spread, 0.01, 0.4)))
     information, error = mixture.information(m, scale)
     without, _, _ = mixture.maximum(_NO_MISMATCH, fixed=True)
@@ -126,6 +131,7 @@ class _Mixture:
             typical.threshold_over_noise(k, pixels.single(k).signal_dn) for k in range(len(pixels.counts))
         ])  # fmt: skip
         rows, pixel = np.nonzero(pixels.cells.trials * ndtr(-u) >= 1.0)
+        # a fixed sample, so that the time does not grow with the sensor
         kept = np.random.default_rng(0).permutation(rows.size)[:_MOST_COUNTS]
         rows, pixel = rows[kept], pixel[kept]
         level = np.array([typical.group(k, pixels.single(k).signal_dn) for k in range(len(pixels.counts))])[rows, pixel]
@@ -180,6 +186,7 @@ class _Mixture:
 
     def information(self, m: float, scale: NDArray) -> tuple[float, float]:
         """Information of m with the groups' thresholds fitted, and the standard error of m."""
+        # second differences of ln L of each count, by m and by its group's threshold
         h, k = 0.02 * m, 0.01
         table = {
             (i, j): self.log_likelihood(m + i * h, scale * (1 + j * k))
@@ -189,6 +196,7 @@ class _Mixture:
         mm = (2 * table[0, 0] - table[1, 0] - table[-1, 0]) / h**2
         ss = (2 * table[0, 0] - table[0, 1] - table[0, -1]) / k**2
         both = (table[1, 1] + table[-1, -1] - 2 * table[0, 0]) / (h * k)
+        # the groups' middle thresholds are fitted with m: what they take of its information is left out
         cross, own = (np.bincount(self.group, v) for v in (-(mm * h / k + ss * k / h + both) / 2, ss))
         part = cross / (np.maximum(own, 0.0) + 1 / _HOLD**2)
         information = float(mm.sum() - part @ cross)

@@ -31,6 +31,7 @@ def start_values(cells: Cells, theta_v: float, law: Law) -> NDArray[np.float64]:
     order = np.argsort(cells.signal_dn)
     few = max(2, len(order) // 10)
     bright = max(float(cells.signal_dn[order[-few:]].mean()), 1e-6)
+    # in the dimmest cells u is B Θ/√2, in the brightest that of A I + B with the shot noise tried
     b = _threshold_over_noise(cells, order[:few]) * np.sqrt(2) / theta_v
     noise = np.array([0.1, 0.5, 2.0, 10.0, 50.0, 200.0, 1000.0])  # C y at the brightest
     x = _threshold_over_noise(cells, order[-few:]) * np.sqrt(2 * (1 + noise**2)) / theta_v
@@ -63,24 +64,30 @@ def _approach(cells: Cells, start: NDArray, theta_v: float, law: Law, free: Sequ
     """Least squares of u [fit, 6]; a start whose A, B or C is not free stays as it is."""
     if not all(free[:3]):
         return np.array(start)
+    # rates away from 0 and ½, where u would be infinite or its slope vanish
     p = np.minimum((cells.events + 0.5) / (cells.total + 1), 0.49)
     v = -ndtri(p)
+    # u of a pixel of typical threshold: the spread of thresholds flattens the mean rate of a cell
     u = v / np.sqrt(np.maximum(cells.relative**2 - (cells.spread * v) ** 2, 0.1))
     weight = cells.total * np.exp(-v * v) / p  # inverse variance of u, but for a factor
     many = np.repeat(start[:, None], _REACH_OF_C.size, axis=1)  # [fit, scale, 6], against cells
     many[..., 2] *= np.exp(2 * _REACH_OF_C)
     many[..., 3] *= np.exp(_REACH_OF_C)
+    # u = A · slope + B · base for each C that is tried, [fit, scale, cell]
     base = theta_v / np.sqrt(2 * relative_variance(coefficients(many), cells.signal_dn, law))
     slope = base * cells.signal_dn
+    # normal equations of the two terms, solved in closed form; A is not below 0
     aa, ab, bb = (np.sum(weight * x * y, axis=-1) for x, y in ((slope, slope), (slope, base), (base, base)))
     ay, by = np.sum(weight * slope * u, axis=-1), np.sum(weight * base * u, axis=-1)
     a = np.maximum((ay * bb - by * ab) / np.maximum(aa * bb - ab * ab, 1e-300), 0.0)
     b = (by - a * ab) / bb
+    # a fit with B below 0 has no meaning: C is chosen among the others
     cost = np.where(b > 0, np.sum(weight * (u - a[..., None] * slope - b[..., None] * base) ** 2, axis=-1), np.inf)
     best = np.argmin(cost, axis=1)
     near, row = np.array(start), np.arange(len(start))
     near[:, 0], near[:, 1] = a[row, best], np.log(np.maximum(b[row, best], 1e-12))
     near[:, 2:4] = many[row, best, 2:4]
+    # where no C works the start stays as it is
     return np.where(np.isfinite(cost[row, best])[:, None], near, start)
 
 
@@ -156,7 +163,9 @@ def maximise(
 
 def _solve(eta: NDArray, score: NDArray, information: NDArray, damping: NDArray | float) -> NDArray[np.float64]:
     """Steps [fit, 6], scaled so that units do not matter. Parameters that would leave a bound are held at it."""
+    # at a bound and pushed outwards: such a parameter has a step of 0
     held = ((eta <= _LEAST) & (score < 0)) | ((eta >= _LARGEST) & (score > 0))
+    # a diagonal of ones, so that one damping serves parameters of any unit
     scale = np.sqrt(np.maximum(np.einsum("fii->fi", information), 1e-250))
     matrix = information / (scale[:, :, None] * scale[:, None, :])
     matrix = np.where(held[:, :, None] | held[:, None, :], 0.0, matrix)
@@ -179,6 +188,7 @@ def _evaluate(
     residual = cells.events - n * p
     if variance is None:
         value = log_likelihood(cells, log_p)
+        # derivatives by ln P: the score of a binomial is (k − n p)/(1 − p), its information n p/(1 − p)
         rest = np.maximum(1 - p, 1e-12)
         influence, weight = residual / rest, n * p / rest
         if searching:
@@ -187,6 +197,7 @@ def _evaluate(
     else:
         value = -0.5 * np.sum(residual**2 / variance, axis=-1)
         influence, weight = residual * n * p / variance, (n * p) ** 2 / variance
+    # sums over cells: gradient, and information of the free parameters; 1 on the diagonal of the others
     score = np.matmul(influence[..., None, :], slope)[..., 0, :]
     information = np.matmul((slope * weight[..., None]).swapaxes(-1, -2), slope)
     return value, score, information + np.diag(1.0 * ~mask)
@@ -204,12 +215,14 @@ def pixel_scores(
     log_p, slope = log_probability(eta, cells, theta_v, law)
     slope = slope * np.asarray(free, bool)
     p = np.exp(log_p)
+    # what one event more of a cell adds to the score, [cell, 6]
     influence = (slope / np.maximum(1 - p, 1e-12)[:, None]) if variance is None else slope * (
         cells.total * p / variance
     )[:, None]  # fmt: skip
     meat = np.zeros((6, 6))
     for begin in range(0, pixels.signal_dn.size, _CHUNK):
         part = np.s_[begin : begin + _CHUNK]
+        # one row a pixel: all its counts together
         score = sum(
             (k[part] - cells.trials * p[cell[part]])[:, None] * influence[cell[part]]
             for k, cell in zip(pixels.counts, pixels.cell, strict=True)
@@ -224,5 +237,6 @@ def sandwich(
     """Covariance [6, 6] of one fit, from the scatter of the pixels' scores; 0 for parameters that are not free."""
     mask = np.asarray(free, bool)
     meat, information = pixel_scores(pixels, eta, theta_v, law, free, variance)
+    # parameters that are not free have neither rows nor columns
     bread = np.linalg.pinv(information, hermitian=True) * mask[:, None] * mask
     return bread @ meat @ bread

@@ -93,6 +93,7 @@ def fit_events(
     free = [True] * 4 + ([False, False] if asymmetry is None else list(asymmetry[4:]))
     whole: NDArray | None = None
     while True:
+        # fit what is still free; then look for the parameter that is determined least
         eta, fisher, variance = _fit(cells, begin, theta_v, law, free)
         whole = eta.copy() if whole is None else whole
         if asymmetry is None:
@@ -106,16 +107,20 @@ def fit_events(
         if weak is None:
             break
         name, index, reason = weak
+        # A and C may be known in combination only: the one goes without which the fit is better
         if index == 2 and free[0] and 0 in mixed and _better_without(0, 2, cells, eta, theta_v, law, free):
             name, index, reason = "A", 0, reasons["A"]
         reasons.setdefault(name, reason)
         free[index] = False
+        # the next fit begins where this one ended, without the parameter
         begin = _without(eta, index)
         if index == 2 and free[3]:
             reasons["D"], free[3], begin[3] = "it has no effect without C", False, 0.0
     mask = np.array(free)
+    # errors are from the scatter of the pixels, not from what the model expects
     measured = sandwich(pixels, eta, theta_v, law, free, variance)
     values, natural_covariance = natural(eta, measured)
+    # how much wider than by the model alone, mean over A to D
     used = np.flatnonzero(mask[:4])
     effect = float(np.mean(np.diag(measured)[used] / np.maximum(np.diag(covariance)[used], 1e-300))) if used.size else 1
     fit = goodness(pixels, eta, theta_v, law, int(mask.sum()))
@@ -134,6 +139,7 @@ def _fit(
     """Parameters [6], information [6, 6] and, where thresholds spread, the variance the cells were weighed with."""
     eta, variance = begin[None], None
     for _ in range(_REWEIGHTED if np.any(cells.spread > 0) else 1):
+        # with a spread of thresholds, the weights depend on the fit, and are found with it
         if np.any(cells.spread > 0):
             variance = cell_variance(cells, eta[0], theta_v, law)
         eta, fisher, _ = maximise(cells, eta, theta_v, law, free, variance)
@@ -185,12 +191,14 @@ def _test_asymmetry(
     for index in (4, 5):
         if free[index]:
             continue
+        # one parameter more, from the fit without it
         wider = list(free)
         wider[index] = True
         tried, information, _ = maximise(cells, eta[None], theta_v, law, wider, variance)
         gain = misfit(eta) - misfit(tried[0])
         if gain <= enough:
             continue
+        # counts of pixels that scatter more than the model says ask for a larger gain
         measured = sandwich(pixels, tried[0], theta_v, law, wider, variance)[index, index]
         dispersed = max(1.0, float(measured / np.maximum(_covariance(information[0])[0][index, index], 1e-300)))
         if gain > enough * dispersed:
@@ -238,6 +246,7 @@ def _covariance(information: NDArray) -> tuple[NDArray[np.float64], list[int]]:
     """Inverse of the information, and the parameters (of A, B, C, D) that are determined only in combination."""
     scale = np.sqrt(np.maximum(np.diag(information), 1e-250))
     value, vector = np.linalg.eigh(information / np.outer(scale, scale))
+    # combinations of parameters on which the counts do not depend
     lost = value < _SINGULAR
     mixed = [k for k in range(4) if np.any(np.abs(vector[k, lost]) > 0.05)]
     inverse = (vector / np.maximum(value, _SINGULAR**2)) @ vector.T
@@ -267,6 +276,7 @@ def with_mismatch_error(fit: EventFit, pixels: PixelCounts, theta_v: float, rela
     """
     if not relative_error > 0:
         return fit
+    # the whole fit again with a spread larger by its error
     wider = replace(pixels, cells=pixels.cells.with_spread(1 + relative_error))
     moved = fit_events(wider, theta_v, fit.law, fit.parameters, fit.free)
     change = np.where(fit.free, moved.values - fit.values, 0.0)

@@ -67,8 +67,10 @@ def goodness(pixels: PixelCounts, parameters: NDArray, theta_v: float, law: Law,
                 (*residual, *expected),
             )
         ]
+        # a correlation matrix that can be inverted, whatever few counts say
         aa, bb = np.maximum(squares[0], 0.1), np.maximum(squares[1], 0.1)
         ab = np.clip(squares[2], -0.99 * np.sqrt(aa * bb), 0.99 * np.sqrt(aa * bb))
+        # residuals of ON and OFF in units of counting, and their quadratic form with the measured scatter
         a, b = (total(r) / np.sqrt(e) for r, e in zip(residual, expected, strict=True))
         chi2 += float(np.sum((a * a * bb - 2 * a * b * ab + b * b * aa) / (aa * bb - ab * ab)))
         groups += a.size
@@ -86,10 +88,12 @@ def _groups(signal_dn: NDArray, events: NDArray) -> NDArray[np.intp]:
     """Pixels in order of brightness, in groups that hold enough of them and of their events."""
     order = np.argsort(signal_dn, kind="stable")
     events = np.cumsum(events[order])
+    # events that a group needs
     enough = float(np.clip(events[-1] / _GROUPS, _FEWEST_EVENTS, _LEAST_EVENTS))
     ends: list[int] = []
     start, before = 0, 0.0
     while start < order.size:
+        # enough events and enough pixels
         end = max(int(np.searchsorted(events, before + enough)) + 1, start + _LEAST_PIXELS)
         if end > order.size:
             break

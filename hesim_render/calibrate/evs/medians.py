@@ -55,6 +55,7 @@ def middle_and_spread(
         parts = by_group(counts + np.random.default_rng(0).uniform(-0.5, 0.5, counts.shape), group)
         # mean without the highest hundredth, which contains the bad pixels, in place of a further quantile
         quantiles.append(np.array([[*np.quantile(part, list(QUANTILES)), _trimmed_mean(part)] for part in parts]))
+    # [group, quantile]: enough events in both polarities, so that both take the same quantile
     enough = np.min([q[:, :-1] for q in quantiles], axis=0) >= LEAST_EVENTS
     first = np.where(enough.any(axis=1), np.argmax(enough, axis=1), levels.size - 1)
     has_quantile, row = enough.any(axis=1), np.arange(first.size)
@@ -65,6 +66,7 @@ def middle_and_spread(
             if not at.any():
                 continue
             low, high = (-ndtri(np.maximum(q[at, j] + 0.5, 0.5) / (trials + 1)) for j in (k, k + 1))
+            # two quantiles give t₁ = u (1 + m z₁) and t₂ = u (1 + m z₂), which are solved for m
             m = (low - high) / np.maximum(high * levels[k] - low * levels[k + 1], 1e-6)
             own = np.mean(
                 [
@@ -74,6 +76,7 @@ def middle_and_spread(
                 axis=0,
             )
             u = low / np.maximum(1 + m * levels[k], 0.1)
+            # the part of m² that counting makes is taken off
             spreads.append((m**2 - own / u**2)[(low > 0.02) & (high > 0)])
     values = np.concatenate(spreads) if spreads else np.empty(0)
     if known is not None:
@@ -89,8 +92,10 @@ def middle_and_spread(
         # the spread of the quantile is that of thresholds and of counting together
         counting = rate * (1 - rate) / trials / density(here) ** 2
         wide = np.sqrt(spread**2 + counting / np.maximum(here, 0.05) ** 2)
+        # back from the deviate of the quantile to the median
         from_quantile = here / np.maximum(1 + wide * levels[first], 0.1)
         v = -ndtri(np.clip((q[:, -1] + 0.5) / (trials + 1), 1e-300, 0.5))
+        # few events: the mean rate of a normal law of thresholds, solved for its middle
         from_mean = v / np.sqrt(np.maximum(1 - (spread * v) ** 2, 0.05))
         middles.append(np.where(has_quantile, from_quantile, from_mean))
     return middles, spread
@@ -107,6 +112,7 @@ def _spread_of_few_events(both: list[NDArray], group: NDArray, means: list[NDArr
         middle = mean[group]
         kept = counts <= np.quantile(counts, 0.99)
         u = -ndtri(np.clip((middle[kept] + 0.5) / (trials + 1), 1e-300, 0.5))
+        # variance beyond that of counting, over the square of the slope of counts by ln θ
         top += float(np.sum((counts[kept] - middle[kept]) ** 2 - middle[kept]))
         bottom += float(np.sum((trials * density(u) * u) ** 2))
     return min(float(np.sqrt(max(top / max(bottom, 1e-300), 0.0))), 0.3)
@@ -140,6 +146,7 @@ class Typical:
         lines, polarities, numbers = [], [], []
         spread = spread_of_thresholds(static, good)
         for signal, *both in static.sessions:
+            # groups of like brightness, few enough for smooth lines of u against signal
             light = signal[good]
             group = like_brightness(light, _LINE)
             middle, _ = middle_and_spread([counts[good] for counts in both], group, static.trials, spread)

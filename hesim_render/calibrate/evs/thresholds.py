@@ -81,6 +81,7 @@ class Thresholds:
             (self.pixel_on, self.noise_on, self.mismatch_on), (self.pixel_off, self.noise_off, self.mismatch_off),
         ):  # fmt: skip
             variance, own = mismatch**2, noise.astype(np.float64) ** 2
+            # the mean of the normal law of a threshold whose estimate has noise
             trust = variance / np.maximum(variance + own, 1e-30)
             result.append((1 + trust * (estimate.astype(np.float64) - 1), np.sqrt(trust * own)))
         (on, on_spread), (off, off_spread) = result
@@ -110,9 +111,11 @@ def fit_thresholds(steps: Steps, step: NDArray[np.float64], good: NDArray[np.boo
     sums = _Sums.of(steps, good)
     result = sums.fit(step, steps.trials)
     values, squares = result[:4], result[4:6]
+    # jackknife: the fit without each group of pixels, [group, 7]
     left_out = np.array([sums.without(k).fit(step, steps.trials, values) for k in range(GROUPS) if sums.pixels[k]])
     covariance = (len(left_out) - 1) * np.cov(left_out.T, bias=True)
     error = np.sqrt(np.diag(covariance))
+    # ON and OFF together decide whether there is a mismatch, then each for itself
     both, both_error = squares.mean(), float(np.sqrt(covariance[4:6, 4:6].sum())) / 2
     mismatch = float(np.sqrt(both)) if both > _SIGMAS * both_error else 0.0
     each = [
@@ -178,8 +181,10 @@ class _Sums:
         squares = []
         for k, sign in enumerate((1.0, -1.0)):
             mean = self.totals[k].sum() / pixels
+            # variance over pixels of the sum of a pixel's events over all steps
             variance = (self.squares[k].sum() / pixels - mean**2) * pixels / max(pixels - 1, 1)
             squares.append(_mismatch_square(values[k], values[2], values[3] * sign, sign * step, variance, trials))
+        # what the width of the curve at either threshold has beyond the spread of thresholds is noise
         left = [
             (values[2] * max(1 + values[3], 0.2)) ** 2 - squares[0] * values[0] ** 2,
             (values[2] * max(1 - values[3], 0.2)) ** 2 - squares[1] * values[1] ** 2,
@@ -190,6 +195,7 @@ class _Sums:
 def _fit_curves(rates: list[NDArray], step: NDArray, n: float, start: NDArray | None) -> NDArray[np.float64]:
     """(θ₊, θ₋, s, κ) of the pooled curves."""
     if start is None:
+        # thresholds where the pooled rates pass ½
         half = [float(np.interp(0.5, *_increasing(r, s))) for r, s in zip(rates, (step, -step), strict=True)]
         half = [max(h, 1e-3 * float(np.abs(step).max())) for h in half]
         start = np.array([half[0], half[1], 0.4 * np.mean(half), 0.0])
@@ -197,6 +203,7 @@ def _fit_curves(rates: list[NDArray], step: NDArray, n: float, start: NDArray | 
     for _ in range(_ROUNDS):
         score, fisher = _score(values, rates, step, n)
         change = np.linalg.lstsq(fisher, score, rcond=None)[0]
+        # steps of 30 % at most, as the score is far from linear beyond
         limit = np.array([0.3, 0.3, 0.3, 0.3]) * np.abs([values[0], values[1], values[2], 1.0])
         change = np.clip(change, -limit, limit)
         values = values + change
@@ -250,6 +257,7 @@ def _totals(
     thresholds: NDArray, theta: float, width: float, slope: float, signed: NDArray, trials: int, m2: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean and variance in time of a pixel's events over all steps, for each of `thresholds`."""
+    # the width of one pixel: that of the pooled curve without the spread of thresholds
     noise = np.sqrt(max(width**2 - max(m2, 0.0) * theta**2, 1e-4 * width**2))
     p = exceedance(thresholds[:, None] - signed, noise * np.maximum(1 + slope * signed / theta, 0.2))
     return trials * p.sum(axis=1), trials * (p * (1 - p)).sum(axis=1)
@@ -270,12 +278,14 @@ def _mismatch_square(theta: float, width: float, slope: float, signed: NDArray, 
         return float(_WEIGHTS @ within + _WEIGHTS @ mean**2 - (_WEIGHTS @ mean) ** 2)
 
     h = 1e-3
+    # slope of the totals by ln θ, for the sign of an m² below 0
     ends, _ = _totals(theta * np.array([1 - h, 1 + h]), theta, width, slope, signed, trials, 0.0)
     slope_squared = max(float(((ends[1] - ends[0]) / (2 * h)) ** 2), 1e-300)
     low = (variance - expected(0.0)) / slope_squared
     if low <= 0:
         return low
     widest = min(0.999 * width / theta, 0.8) ** 2
+    # the spread cannot be wider than the whole curve
     if expected(widest) < variance:
         return widest
     return float(brentq(lambda m2: expected(m2) - variance, 0.0, widest, xtol=1e-10))
@@ -290,6 +300,7 @@ def _of_pixel(
     # where no step separates thresholds the slope vanishes: the threshold is then known to within the mismatch only
     slope = np.maximum(-np.gradient(mean, _GRID), 1e-3 * trials)
     error = np.sqrt(variance + 0.25) / slope
+    # totals fall with the threshold; made strictly monotonic for the look-up
     falling = -np.minimum.accumulate(mean) + 1e-9 * np.arange(_GRID.size)
     pixel = np.interp(-total, falling, _GRID)
     return pixel.astype(np.float32), np.interp(pixel, _GRID, error).astype(np.float32)
