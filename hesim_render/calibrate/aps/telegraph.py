@@ -66,6 +66,7 @@ def find_telegraph(
     place = np.flatnonzero(_suspects(moments, used, tile, full_scale_dn))
     if place.size == 0:
         return maps
+    # [exposure, frame, pixel]: the suspects alone are held in memory
     values = np.empty((*stack.shape[:2], place.size), np.uint16)
     for number, frame in enumerate(stack):
         values[divmod(number, stack.shape[1])] = frame.ravel()[place]
@@ -85,6 +86,7 @@ def _suspects(
     excess, freedom = np.zeros(used.shape), np.zeros(used.shape)
     clear = (moments.lowest > 0) & (moments.highest < full_scale_dn)
     t = moments.exposures_s
+    # dark current of each pixel, from the shortest and the longest exposure
     dark_dn_per_s = (moments.mean[-1] - moments.mean[0]) / (t[-1] - t[0])
     for k in range(t.size):
         for i, j in np.ndindex(tile):
@@ -92,6 +94,7 @@ def _suspects(
             here = used[cut] & clear[k][cut]
             if here.any():
                 variance = moments.variance[k][cut]
+                # χ² of the pixel's sample variances, added up over exposures
                 expected = _usual_variance(variance, t[k] * dark_dn_per_s[cut], here)
                 excess[cut] += np.where(here, (moments.frames - 1) * variance / expected, 0.0)
                 freedom[cut] += np.where(here, moments.frames - 1, 0)
@@ -99,6 +102,7 @@ def _suspects(
     beyond = np.where(freedom > 0, excess / limit, 0.0)
     suspects = beyond > 1
     if suspects.sum() > _MOST:
+        # the most suspicious ones
         suspects &= beyond >= np.partition(beyond.ravel(), -_MOST)[-_MOST]
     return suspects
 
@@ -117,6 +121,7 @@ def _usual_variance(variance: NDArray, dark_dn: NDArray, here: NDArray[np.bool_]
     low, high = np.quantile(dark_dn[here], (0.5, 0.95))
     least, most = here & (dark_dn <= low), here & (dark_dn >= high)
     x, y = ([float(np.median(values[part])) for part in (least, most)] for values in (dark_dn, variance))
+    # shot noise of the dark current; medians of both ends are hardly changed by bad pixels
     slope = max((y[1] - y[0]) / (x[1] - x[0]), 0.0) if x[1] > x[0] else 0.0
     return np.maximum(y[0] + slope * (dark_dn - x[0]), max(0.5 * y[0], ADC_VARIANCE_DN2))
 
@@ -163,12 +168,14 @@ def fit_two_levels(values: NDArray, exposures_s: NDArray[np.float64]) -> TwoLeve
     line, one_width = _line(y, np.broadcast_to(t, y.shape), None)
     rest = y - line[0] - line[1] * t
     count = y.shape[0] * y.shape[1]
+    # ln L of a normal law at its own variance
     one = -0.5 * count * (np.log(2 * np.pi * one_width**2) + 1)
     # The fit begins twice, and the likelier result is kept. States above and below the median of each exposure suit
     # many changes of level within an exposure, states above and below the straight line suit few changes.
     ends = [_climb(y, t, rest > 0), _climb(y, t, y > np.median(y, axis=1, keepdims=True))]
     better = ends[1][-1] > ends[0][-1]
     level, width, share, correlation, log_likelihood = (np.where(better, b, a) for a, b in zip(*ends, strict=True))
+    # the higher level is the one whose share is stated
     share = np.where(level[2] < 0, 1 - share, share)
     visits = count * np.minimum(share, 1 - share)
     return TwoLevels(np.abs(level[2]), share, correlation, width, log_likelihood - one, visits)

@@ -66,6 +66,7 @@ def rate_spread(tally: EventTally, polarity: int) -> dict[str, Any]:
     if halves.sum() < 2 * _EVENTS_TO_BE_SILENT:
         return not_identifiable(f"{int(halves.sum())} events in all")
     group = tally.group.astype(np.int64)
+    # sums of each group of pixels: number, counts of both halves, and their product, [4, group]
     sums = np.array([np.bincount(group, v, GROUPS) for v in (np.ones(tally.pixels), *halves, halves[0] * halves[1])])
 
     def relative(s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -73,6 +74,7 @@ def rate_spread(tally: EventTally, polarity: int) -> dict[str, Any]:
         return (means[2] - means[0] * means[1]) / np.maximum(means[0] * means[1], 1e-300)
 
     whole = float(relative(sums.sum(axis=1)))
+    # the same without each group, for the jackknife
     parts = relative(sums.sum(axis=1)[:, None] - sums)
     error = float(jackknife(np.append(whole, parts)))
     if whole <= 2 * error:
@@ -86,6 +88,7 @@ def regularity(tally: EventTally) -> dict[str, Any]:
     pairs = int(tally.pairs.sum())
     if pairs < _LEAST_PAIRS:
         return not_identifiable(f"{pairs} pairs of successive ON intervals; {_LEAST_PAIRS} are needed")
+    # mean over pairs of intervals, then the same without each group
     whole = tally.variation.sum() / pairs
     parts = (tally.variation.sum() - tally.variation) / np.maximum(pairs - tally.pairs, 1)
     error = float(jackknife(np.append(whole, parts)))
@@ -161,7 +164,9 @@ def balance_with_target(
     leak_hz : leak of a pixel while the target moved, Hz.
     """
     on, off = moving.per_pixel().astype(np.float64)
+    # pixels that the target passed over
     seen = off > 0.25 * np.median(off[off > 0])
+    # each pixel's ratio θ₋/θ₊: its levels are balanced over the recording
     own = np.where(seen, (on - leak_hz * moving.seconds) / np.maximum(off, 1.0), 0.0)
     group = moving.group.astype(np.int64)
     each = np.array([
@@ -172,6 +177,7 @@ def balance_with_target(
     pixels = np.bincount(group[seen], minlength=GROUPS)
     sums = np.concatenate([each.sum(axis=1, keepdims=True), each.sum(axis=1, keepdims=True) - each], axis=1)
     leak = sums / np.append(pixels.sum(), pixels.sum() - pixels)
+    # the leak's part of that ratio, of which a tenth is not known
     share = abs(leak_hz) * moving.seconds * float(np.mean(1 / off[seen]))
     unknown = UNSURE_LEAK * share * np.array([group_rates(one)[1, 0] for one in tallies])
     return _with_ratio(leak, unknown, lux, ratio)
@@ -201,6 +207,7 @@ def _three_lights(rates: NDArray[np.float64], lux: NDArray[np.float64]) -> NDArr
     for _ in range(10):
         weight = 1 / np.maximum(jackknife(rates[:, 0] - np.clip(ratio[0], 0.05, 20.0) * rates[:, 1]), 1e-12)
         for k in range(GROUPS + 1):
+            # columns n₋, 1 and L, each of length 1 for the test of the condition
             design = np.stack([rates[:, 1, k], np.ones(lux.size), lux], axis=1) * weight[:, None]
             size = np.linalg.norm(design, axis=0)
             if np.any(size == 0) or np.linalg.cond(design / size) > 1e6:
@@ -223,6 +230,7 @@ def _line(
         reason = not_identifiable(f"the leak is known at {np.unique(level).size} lights; two are needed")
         return reason, reason
     weight = 1 / np.maximum(np.hypot(jackknife(leak[known]), unknown[known]), 1e-12)
+    # the line as a matrix on the leaks, so that errors go through it
     design = np.stack([np.ones(level.size), level], axis=1) * weight[:, None]
     size = np.linalg.norm(design, axis=0)
     line = np.linalg.pinv(design / size) / size[:, None] * weight
@@ -251,6 +259,7 @@ def hot_pixels(tallies: Sequence[EventTally]) -> NDArray[np.bool_]:
     hot = np.ones(tallies[0].pixels, np.bool_)
     for one in tallies:
         count = one.per_pixel()[0]
+        # mean of the lower nine tenths, which hot pixels do not change
         usual = float(np.sort(count)[: max(1, round(0.9 * count.size))].mean()) + 1 / count.size
         hot &= count > stats.poisson.isf(_HOT_CHANCE / count.size, _HOT * usual)
     return hot
@@ -284,6 +293,7 @@ def not_still(tally: EventTally) -> str | None:
     count = tally.slices.sum(axis=(0, 2))
     if count.sum() == 0:
         return None
+    # rate of each slice of time, Hz a pixel
     each = count / (tally.pixels * tally.seconds / SLICES)
     mean = each.mean()
     early, late = each[: SLICES // 4].mean(), each[-SLICES // 4 :].mean()

@@ -99,14 +99,17 @@ class Balance:
             # a pixel that was released compares with a new level: what waited has no partner any more
             released = self._ready_us[pixel] < t_us
             self._count[EFFECT, pixel[released & (self._count[EFFECT, pixel] != 0)]] = 0
+        # a step of the other sequence in the same direction waits: the two are a pair
         match = self._count[other, pixel] * sign > 0
         result = self._pop(other, pixel[match])
         pairs.append((result, number[match]) if own == EFFECT else (number[match], result))
         rest = ~match
         if self._dead_us is not None and own == CAUSE:
+            # a cause in the dead time has no effect
             asleep = rest & (t_us <= self._ready_us[pixel])
             lost.append(number[asleep])
             rest &= ~asleep
+        # a step back of the same sequence undoes the one before
         back = rest & (self._count[own, pixel] * sign < 0)
         self._pop(own, pixel[back])
         wait = rest & ~back
@@ -116,6 +119,7 @@ class Balance:
 
     def _pop(self, side: int, pixel: NDArray[np.int64]) -> NDArray[np.int64]:
         """Numbers of the latest waiting steps, which wait no longer."""
+        # the last one in is the first one out
         count = self._count[side, pixel]
         result = self._waiting[side, pixel, np.abs(count) - 1]
         self._count[side, pixel] = count - np.sign(count)
@@ -124,6 +128,7 @@ class Balance:
     def _push(self, side: int, pixel: NDArray[np.int64], sign: NDArray[np.int64], number: NDArray[np.int64]) -> None:
         place = np.abs(self._count[side, pixel])
         room = self._waiting.shape[2]
+        # room for twice as many
         if place.size and place.max() >= room:
             self._waiting = np.concatenate([self._waiting, np.zeros_like(self._waiting)], axis=2)
         self._waiting[side, pixel, place] = number
@@ -162,6 +167,7 @@ class LastSteps:
         pairs: list[tuple[NDArray, NDArray]] = [(np.empty(0, np.int64), np.empty(0, np.int64))]
         for own, (t_us, pixel, sign, number) in _rounds(causes, effects):
             match = self._sign[1 - own, pixel] == sign
+            # the step of the other sequence that waits in the same direction
             result = self._number[1 - own, pixel[match]]
             pairs.append((result, number[match]) if own == EFFECT else (number[match], result))
             self._sign[1 - own, pixel[match]] = 0
@@ -178,9 +184,11 @@ def _rounds(causes: PixelSteps, effects: PixelSteps) -> Iterator[tuple[int, Pixe
     if every.pixel.size == 0:
         return
     side = np.repeat([CAUSE, EFFECT], [causes.pixel.size, effects.pixel.size])
+    # by pixel, then time, then causes before effects
     order = np.lexsort((side, every.t_us, every.pixel))
     pixel = every.pixel[order]
     first = np.flatnonzero(np.diff(pixel, prepend=pixel[0] - 1))
+    # number of each step among those of its pixel: steps of one rank are of different pixels
     rank = np.arange(order.size) - np.repeat(first, np.diff(np.append(first, order.size)))
     by_rank = np.argsort(rank, kind="stable")
     for here in np.split(order[by_rank], np.cumsum(np.bincount(rank))[:-1]):

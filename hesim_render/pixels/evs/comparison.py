@@ -61,21 +61,25 @@ class PreviousSample:
         level, variance = self._noise.log_level(electrons)
         if self._photoreceptor:
             level = self._photoreceptor.follow(level, t_us)
+        # four random words for each pixel and sample: two for the noise, one for a leak event
         word = philox(self._seed, Stream.EVS, self._noise.on_device.key, t_us).next_uint32x4()
         deviate = normal_pair(word[0], word[1])[0]
         if not self._independent:
+            # shared noise: the noise of a sample is in both of its comparisons
             level = dr.fma(dr.sqrt(variance), deviate, level)
         if self._level is None:
             self._keep(level, variance, t_us)
             return no_events()
         change = level - self._level
         if self._independent:
+            # independent noise: each comparison draws that of both samples anew
             change = dr.fma(dr.sqrt(variance + self._variance), deviate, change)
         theta_on, theta_off = self._noise.on_device.thresholds
         on, off = change > theta_on, change < -theta_off
         polarity = dr.select(on, types.Int8(1), dr.select(off, types.Int8(-1), types.Int8(0)))
         if self._noise.leak_rate_hz > 0:
             probability = leak_probability(self._noise.leak_rate_hz, (t_us - self._t_us) * S_PER_US)
+            # a whole number of 2³² as the bound, opaque so that no rate is written into the kernel
             leaks = word[2] < dr.opaque(types.UInt32, min(round(probability * 2**32), 2**32 - 1))
             polarity = dr.select(~on & ~off & leaks, types.Int8(Origin.LEAK), polarity)
         begin_us = self._t_us
@@ -146,6 +150,7 @@ class LastEvent:
         """Begin in still light: where noise makes events, as pixels are after a long time in it, or all at a reset."""
         import drjit as dr
 
+        # without noise, or after a reset, all pixels begin with the level of the first sample
         settles = self._band_noise is not None and not self._is_reset
         self._t_us = t_us - self._band_noise.periods_us(_SETTLING_PERIODS) if settles and self._band_noise else t_us
         start = self._photoreceptor.start(log, self._t_us) if self._photoreceptor else log
@@ -158,6 +163,7 @@ class LastEvent:
         if self._band_noise and settles:
             count = self._pixels
             share = self._band_noise.share(count)
+            # reference and dead time of each pixel are drawn from the stationary law of its light
             spreads = np.broadcast_to(spread.numpy(), count)
             begin = start_of(self._noise, self._seed, spreads, share, self._band_noise.angle)
             self.reference = dr.fma(spread, jit().Float(begin.reference), log)
@@ -182,8 +188,10 @@ class LastEvent:
         low_pass = self._photoreceptor
         if low_pass and low_pass.rests(log, t_us):
             low_pass = None
+        # between two nodes everything goes on straight lines, so that crossings have a closed form
         for end_us in _nodes_us(t_us, self._band_noise, low_pass):
             part = dr.opaque(jit().Float, (end_us - self._t_us) / (t_us - self._t_us))
+            # ln x on a line from sample to sample, then through the filter
             level = dr.fma(log - self._log, part, self._log)
             if low_pass:
                 level = low_pass.to(level, end_us)
@@ -203,6 +211,7 @@ class LastEvent:
         events = np.concatenate(parts)
         if self._drift:
             events = events[np.argsort(events["t_us"], kind="stable")]
+            # a long way of the drift is taken off level and reference together, so that float32 keeps small steps
             lower = jit().Float(self._drift.pass_by(events, self._cols, electrons, self._t_us, t_us))
             self.level, self.reference = self.level - lower, self.reference - lower
             dr.eval(self.level, self.reference)
@@ -224,6 +233,7 @@ class LastEvent:
             return self._crossings_with_dead_time(self._refractory, level, begin_us, end_us)
         types = jit()
         theta_on, theta_off = self._noise.on_device.thresholds
+        # [pixel]; the threshold of the direction in which the level went
         distance = level - self.reference
         theta = dr.select(distance > 0, theta_on, theta_off)
         crossed = dr.mulsign(dr.floor(dr.abs(distance) / theta), distance)  # thresholds, with the direction
@@ -234,14 +244,17 @@ class LastEvent:
         result = np.flatnonzero(crossed.numpy())
         if len(result) == 0:
             return no_events()
+        # only pixels with an event go to the host
         pixel = types.UInt32(result.astype(np.uint32))
         gathered = [dr.gather(types.Float, value, pixel) for value in (crossed, *before, level)]
         gathered.append(dr.select(gathered[0] > 0, take(theta_on, pixel), -take(theta_off, pixel)))
         dr.eval(gathered)
         count, *values = (np.array(value).astype(np.float64) for value in gathered)
+        # a pixel that crosses k thresholds has k events: number 1 to k of each, [event]
         repeats = np.abs(count).astype(np.int64)
         number = np.arange(1, repeats.sum() + 1) - np.repeat(np.cumsum(repeats) - repeats, repeats)
         reference_0, level_0, level_1, theta_signed = (np.repeat(value, repeats) for value in values)
+        # part of the segment at which the line reaches the threshold of that number
         travel = level_1 - level_0
         # a crossing that rounding moved out of the previous segment is due at once
         part = (reference_0 + number * theta_signed - level_0) / np.where(travel == 0, np.inf, travel)
@@ -266,6 +279,7 @@ class LastEvent:
             due.append(self._defects.between(begin_us, end_us)[:2])
             origins.append(np.full(len(due[-1][0]), Origin.DEFECT, np.float64))
         due_us, due_pixel = (np.concatenate(values) for values in zip(*due, strict=True))
+        # leaks and defects end or lengthen dead times, so that all events are taken together
         levels, thresholds = (self.level, level), self._noise.on_device.thresholds
         self.reference, t_us, pixel, polarity = refractory.crossings(
             self.reference, levels, thresholds, begin_us, end_us, (due_us, due_pixel, np.concatenate(origins))

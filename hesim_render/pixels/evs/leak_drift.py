@@ -4,7 +4,7 @@ The current of a junction in the change amplifier, and a photocurrent of its own
 reference [nozaki2017]. Without noise a pixel gives ON events in equal intervals θ₊/current; its noise moves them. The
 current of a pixel, in thresholds of the nominal pixel per second, is::
 
-    (rate_hz + rate_hz_per_dn · I)(1 + spread · z) + tail,   P(tail > r) = tail_hz/(tail_hz + r)
+    (rate_hz + rate_hz_per_dn · I)(1 + spread_rel · z) + tail,   P(tail > r) = tail_hz/(tail_hz + r)
 
 with z a normal deviate of the pixel, the factor not below 0.05, and no tail above 1000 Hz.
 

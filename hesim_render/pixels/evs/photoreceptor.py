@@ -109,6 +109,7 @@ class Photoreceptor:
         import drjit as dr
 
         z, y = self._state
+        # the light is that of before, and z and y are too small to matter
         still = (log == self._input) & (z * z + y * y < _SETTLED**2)
         if not dr.all(still)[0]:
             return False
@@ -143,9 +144,11 @@ class Photoreceptor:
 
         types = jit()
         begin, elapsed = self._input, dr.opaque(types.Float, elapsed_us)
+        # the largest corner, and the part of the line, 0 to 1, after which the light reaches it
         largest = dr.opaque(types.Float, _rate(self._spec.cutoff_hz))
         line = dr.select(change == 0, types.Float(1e-30), change)
         reached = dr.clip((self._noise.on_device.log_of_largest_corner - begin) / line, 0.0, 1.0)
+        # falling light begins at the limit, rising light ends there
         first, last = dr.select(change < 0, reached, 0.0), dr.select(change < 0, 1.0, reached)
 
         def at_limit(state: _State, part: Float) -> _State:
@@ -165,9 +168,11 @@ class Photoreceptor:
         """
         import drjit as dr
 
+        # corner times elapsed time at the three points of the quadrature
         rates = [self._rate_at(dr.fma(change, place, begin)) * elapsed_us for place in _PLACES]
         total = sum(weight * rate for weight, rate in zip(_WEIGHTS, rates, strict=True))
         rests = [sum(weight * rate for weight, rate in zip(row, rates, strict=True)) for row in _REST]
+        # what is left at the end of what came in at each point
         decays = [weight * dr.exp(-rest) for weight, rest in zip(_WEIGHTS, rests, strict=True)]
         lag = sum(decays)
         later = sum(decay * rest for decay, rest in zip(decays, rests, strict=True))
@@ -188,6 +193,7 @@ class Photoreceptor:
         if self.rests(log, t_us):
             return log
         if self._spec.follows_light:
+            # corners that follow the light need nodes, between which ln x is a line
             before, begin_us = self._input, self._t_us
             for node_us in self.nodes_us(t_us):
                 part = dr.opaque(jit().Float, (node_us - begin_us) / (t_us - begin_us))

@@ -66,6 +66,7 @@ class BandNoise:
         self._state: tuple[Float, Float] = (None, None)  # u and u'/a at the next one
 
     def _deviates(self, node: int) -> tuple[Float, Float]:
+        # deviates belong to a node, whatever was asked for before
         word = philox(self._seed, Stream.EVS, self._key, node & ((1 << 48) - 1)).next_uint32x4()
         return normal_pair(word[0], word[1])
 
@@ -119,11 +120,13 @@ class BandNoise:
         """The noise at `t_us`, which lies at most one node ahead of the present."""
         import drjit as dr
 
+        # how far the time is on the way to the next node
         part = t_us / self._period_us - self._node
         if part > 1.0 - 1e-9:  # the next node is reached, but for rounding
             self._node += 1
             self._advance()
             part = max(t_us / self._period_us - self._node, 0.0)
+        # a line between nodes
         value = dr.fma(self._state[0] - self._value, dr.opaque(jit().Float, part), self._value)
         return value if self._photoreceptor is None else value * self._scale()
 
@@ -156,6 +159,7 @@ def _step(value: Float, speed: Float, h: Float, z: tuple[Float, Float]) -> tuple
     import drjit as dr
 
     decay = dr.exp(-h)
+    # Horner's scheme of the series of Var u, from its last term
     x, squared = 2.0 * h, decay * decay
     series = dr.fma(x, -1 / 960, 1 / 168)
     for term in (-1 / 36, 1 / 10, -1 / 4, 1 / 3):
@@ -163,6 +167,7 @@ def _step(value: Float, speed: Float, h: Float, z: tuple[Float, Float]) -> tuple
     exact = 1.0 - squared * dr.fma(x, dr.fma(x, 0.5, 1.0), 1.0)
     own = dr.select(x < _SERIES_BELOW, 0.5 * x * x * x * series, exact)
     both = 0.5 * squared * x * x
+    # variance of u'/a that is left when its part common with u is taken off (Cholesky)
     rest = 1.0 - squared * dr.fma(x, dr.fma(x, 0.5, -1.0), 1.0) - both * both / own
     root = dr.sqrt(own)
     return (
@@ -206,10 +211,12 @@ class LeakProcess:
 
         types = jit()
         end_us = dr.opaque(types.Float64, float(t_us))
+        # pixels with an event before the end; after each round those that have another one
         pixel: UInt32 = dr.compress(self._due_us <= end_us)
         while dr.width(pixel):
             due_us = dr.gather(types.Float64, self._due_us, pixel)
             count = dr.gather(types.UInt32, self._count, pixel) + 1
+            # the next waiting time has the number of the event as its counter
             following = due_us + self._wait_us(dr.gather(types.UInt32, self._key, pixel), count)
             dr.eval(due_us, count, following)
             dr.scatter(self._due_us, following, pixel)

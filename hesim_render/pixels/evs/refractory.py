@@ -110,30 +110,38 @@ class Refractory:
         """Reference and end of the dead time after the segment, and its events. Each round has the next event of every
         pixel.
         """
+        # leaks by pixel, then by time; a sentinel that is never due at the end
         order = np.lexsort(leak[:2])
         leak_us, leak_origin = np.append(leak[0][order], np.inf), np.append(leak[2][order], 0.0)
+        # range of each pixel's leaks in that list
         turn, last = (np.searchsorted(leak[1][order], pixel, side=side) for side in ("left", "right"))
         travel, length = high - low, end_us - begin_us
         result: list[tuple[NDArray, NDArray, NDArray]] = []
         here = np.arange(pixel.size)
         while here.size:
+            # the next crossing of each pixel, not before its dead time ends
             distance = high[here] - own[here]
             sign = np.where(distance > 0, 1.0, -1.0)
             theta = np.where(distance > 0, thresholds[0][here], thresholds[1][here])
             part = (own[here] + sign * theta - low[here]) / np.where(travel[here] == 0, np.inf, travel[here])
             crossing_us = np.maximum(begin_us + np.maximum(np.clip(part, 0.0, 1.0) * length, _SOON_US), ready[here])
+            # no crossing: the line ends before the threshold, or the pixel sleeps to the end of the segment
             crossing_us[(np.abs(distance) < theta) | (ready[here] > end_us)] = np.inf
+            # what comes first, a leak or a crossing
             due = np.where(turn[here] < last[here], turn[here], -1)
             due_us = leak_us[due]
             leaks = due_us < crossing_us
             t_us = np.where(leaks, due_us, crossing_us)
+            # a leak in the dead time is lost
             fires = np.isfinite(t_us) & ~(leaks & (due_us < ready[here]))
             turn[here[leaks]] += 1
             firing = here[fires]
             result.append((t_us[fires], pixel[firing], np.where(leaks, leak_origin[due], sign)[fires]))
             ready[firing] = t_us[fires] + self._period_us
+            # a pixel that is released within the segment compares with the level of that moment
             released = firing[ready[firing] <= end_us]
             own[released] = low[released] + (ready[released] - begin_us) / length * travel[released]
+            # pixels with neither leak nor crossing left are done
             here = here[np.isfinite(t_us)]
         t_us, fired, polarity = (np.concatenate(values) for values in zip(*result, strict=True))
         return own, ready, t_us, fired, polarity
