@@ -7,21 +7,17 @@ for whole pictures and quick for some pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from math import ceil, log2
 
 import numpy as np
 from mitsuba_frozen import FrozenPixels, Work
-from mitsuba_specfilm import require_plain_lens
+from mitsuba_specfilm import require_plain_lens, using_variant
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.core.device_types import MitsubaModule
-from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.errors import RangeError
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.light_parts import light_parts
-from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.scene import Scene
 
 VARIANT = "scalar_spectral"
@@ -35,31 +31,6 @@ SAMPLES, _MOST_SAMPLES = 16, 1024
 MOST_RAYS = 1 << 15
 #: Factor on the wanted error, because the scatter from the pilot is uncertain.
 _MARGIN = 0.8
-
-
-@contextmanager
-def using_variant(name: str | None) -> Iterator[MitsubaModule]:
-    """The mitsuba module, temporarily in another variant (``scalar_spectral``); None keeps the variant of the backend.
-
-    Raises
-    ------
-    SpecError
-        If this build of Mitsuba lacks the variant.
-    """
-    mi = mitsuba()
-    if name is None or name == mi.variant():
-        yield mi
-        return
-    if name not in mi.variants() or "spectral" not in name:
-        spectral = ", ".join(v for v in mi.variants() if "spectral" in v)
-        raise SpecError(f"no spectral Mitsuba variant {name!r}; this build has {spectral}")
-    before = mi.variant()
-    mi.set_variant(name)
-    mi.set_log_level(mi.LogLevel.Error)
-    try:
-        yield mi
-    finally:
-        mi.set_variant(before)
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import atan, degrees
 from typing import Any
 
 import numpy as np
-from mitsuba_reference import using_variant
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.device_types import MitsubaModule
@@ -18,12 +19,37 @@ from hesim_render.sources.render.camera import MITSUBA_AXES, View, place_camera
 from hesim_render.sources.render.exact import used_responses
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.scene.builder import build
-from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict, transform
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba, spectrum_dict, transform
 from hesim_render.sources.render.scene.parents import camera_trajectory
 from hesim_render.sources.scene import Scene
 
 #: Effects that Mitsuba's cameras have, or that are factors on their pictures.
 _MITSUBA_HAS = ("relative_illumination", "depth_of_field")
+
+
+@contextmanager
+def using_variant(name: str | None) -> Iterator[MitsubaModule]:
+    """The mitsuba module, temporarily in another variant (``scalar_spectral``); None keeps the variant of the backend.
+
+    Raises
+    ------
+    SpecError
+        If this build of Mitsuba lacks the variant.
+    """
+    mi = mitsuba()
+    if name is None or name == mi.variant():
+        yield mi
+        return
+    if name not in mi.variants() or "spectral" not in name:
+        spectral = ", ".join(v for v in mi.variants() if "spectral" in v)
+        raise SpecError(f"no spectral Mitsuba variant {name!r}; this build has {spectral}")
+    before = mi.variant()
+    mi.set_variant(name)
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield mi
+    finally:
+        mi.set_variant(before)
 
 
 @dataclass(frozen=True)
