@@ -80,7 +80,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "tests/sources/render/test_projection.py",
     ),
     "sources.render.glare": ("tests/sources/render/test_lens_effects.py",),
-    "pixels.normal": ("tests/pixels/test_noise_aps.py", "tests/pixels/test_noise_evs.py"),
+    "core.rng:normal_pair": ("tests/pixels/test_noise_aps.py", "tests/pixels/test_noise_evs.py"),
 }
 
 

@@ -2,7 +2,7 @@
 
 The mosaic is the first image of the file, so every TIFF reader gets the DN themselves. A small
 8-bit sRGB picture follows as a second image (NewSubfileType 1). Most readers support 2×2 patterns of three colours
-only, so a recording of another tile also holds a ``preview.dng`` (`recording.preview_dng`). Tags follow DNG 1.4 and
+only, so a recording of another tile also holds a ``preview.dng`` (`recording.showcase`). Tags follow DNG 1.4 and
 TIFF/EP (ISO 12234-2).
 
 The noise of a sensor's frames in the two numbers that DNG has for it (tag NoiseProfile).
