@@ -28,7 +28,7 @@ import isp_images as pictures  # the generator of the tests
 
 import hesim_render as hr
 from hesim_render.isp import DEFAULT, DENOISED_PICTURE, PICTURE, Camera, FrameNoise, Pipeline, develop, process
-from hesim_render.isp.smooth import reduce_noise
+from hesim_render.isp.denoise import reduce_noise
 from hesim_render.isp.steps import Development
 
 FLOAT = Pipeline.of(*[item.step for item in DEFAULT.steps[:-1]], {"step": "encode", "depth": "float"})

@@ -17,7 +17,7 @@ from hesim_render.benchmark.draws import log_uniform
 from hesim_render.specs.benchmark import ScenesSpec
 from hesim_render.spectral.spectrum import colorchecker_reflectances
 from hesim_render.spectral.transfer import encode_exactly
-from hesim_render.targets.leaves import leaves_picture
+from hesim_render.targets.resolution import leaves_picture
 
 #: Side of a texture, texels.
 SIDE = 256

@@ -16,7 +16,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import WholeFile
 from hesim_render.core.units import S_PER_US
 from hesim_render.specs.geometry import Region
-from hesim_render.specs.noise_file import NoiseFile
+from hesim_render.specs.sensor import NoiseFile
 
 #: Maps that a sensor takes from each section; thresholds are known only where contrast steps were captured.
 SENSOR_MAPS = {

@@ -17,7 +17,7 @@ from hesim_render.calibration.spec import (
     FrameSection,
 )
 from hesim_render.core.errors import SpecError
-from hesim_render.specs.noise_file import NoiseFile
+from hesim_render.specs.sensor import NoiseFile
 
 
 def with_intervals(own: Mapping[str, Mapping[str, Any]], noise: NoiseFile, data: CalibrationSpec) -> NoiseFile:

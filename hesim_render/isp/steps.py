@@ -14,9 +14,9 @@ from pydantic import Field, ValidationInfo, field_validator
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.guard import reading
 from hesim_render.core.npz import read_array, read_arrays
-from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
+from hesim_render.isp import balance, chart, colour, fill, levels, tone
 from hesim_render.isp.demosaicing import demosaic
-from hesim_render.isp.denoise import denoise
+from hesim_render.isp.denoise import denoise, reduce_noise
 from hesim_render.isp.frame_noise import FrameNoise
 from hesim_render.isp.rows import row_offsets
 from hesim_render.mosaic.colour_profile import Camera
@@ -214,7 +214,7 @@ class Demosaic(Strict):
 
 
 class NoiseReduction(Strict):
-    """`smooth.reduce_noise`."""
+    """`denoise.reduce_noise`."""
 
     step: Literal["noise_reduction"]
     luma: float = Field(0.005, ge=0)
@@ -222,7 +222,7 @@ class NoiseReduction(Strict):
     radius_px: int = Field(3, ge=1, le=50)
 
     def run(self, state: Development) -> None:
-        state.image = smooth.reduce_noise(state.image, self.luma, self.chroma, self.radius_px)
+        state.image = reduce_noise(state.image, self.luma, self.chroma, self.radius_px)
 
 
 class ColourMatrix(Strict):

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.bands import in_bands
 from hesim_render.core.errors import RangeError
-from hesim_render.isp.smooth import guided_filter
+from hesim_render.isp.denoise import guided_filter
 
 #: Luminance below which a local curve does not brighten further; 1 is white.
 _FLOOR = 1e-3

@@ -20,9 +20,8 @@ from hesim_render.core.units import S_PER_US
 from hesim_render.sensor.from_data_sheet import derive
 from hesim_render.specs.event_pixels import DERIVED, SHEETS, EvsSpec
 from hesim_render.specs.files import apply_overrides, load_yaml, locate, validate
-from hesim_render.specs.noise_file import NoiseFile, NoisePart
 from hesim_render.specs.problems import line_of
-from hesim_render.specs.sensor import SensorSpec, SheetSensorSpec
+from hesim_render.specs.sensor import NoiseFile, NoisePart, SensorSpec, SheetSensorSpec
 from hesim_render.specs.sensor_checks import unused
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from hesim_render.specs.charts import (
 from hesim_render.specs.target import TargetSpec
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.spectrum import Spectrum, constant
-from hesim_render.targets import boards, leaves, resolution
+from hesim_render.targets import boards, resolution
 from hesim_render.targets.cube import image
 from hesim_render.targets.piece import (
     Picture,
@@ -133,7 +133,7 @@ _BUILDERS: dict[type, Callable[[Any], list[TargetPiece]]] = {
     chart_specs.PatchChartTarget: patch_chart,
     chart_specs.StepWedgeTarget: step_wedge,
     chart_specs.GreyRampTarget: grey_ramp,
-    chart_specs.DeadLeavesTarget: leaves.dead_leaves,
+    chart_specs.DeadLeavesTarget: resolution.dead_leaves,
     chart_specs.ImageTarget: image,
     chart_specs.IntegratingSphereTarget: integrating_sphere,
     resolution_specs.SlantedEdgeTarget: resolution.slanted_edge,

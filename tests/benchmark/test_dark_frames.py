@@ -7,7 +7,7 @@ import hesim_render as hr
 from hesim_render.benchmark.exposure_merge import flux_of, flux_scores, merged_exposures
 from hesim_render.benchmark.torch_dataset import signal_of
 from hesim_render.isp import Pipeline, demosaic, process
-from hesim_render.isp.smooth import reduce_noise
+from hesim_render.isp.denoise import reduce_noise
 from hesim_render.measure.pictures import delta_e, psnr, ssim
 from hesim_render.mosaic.description import describe
 from hesim_render.spectral.transfer import from_root, to_root

@@ -28,8 +28,8 @@ from hesim_render.isp import (
     tone,
 )
 from hesim_render.isp.colour import colour_matrix
+from hesim_render.isp.denoise import reduce_noise
 from hesim_render.isp.develop import _illumination
-from hesim_render.isp.smooth import reduce_noise
 from hesim_render.mosaic.layout import Layout
 from hesim_render.recording import manifest
 from hesim_render.recording.recording import Recording

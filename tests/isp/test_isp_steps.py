@@ -7,7 +7,7 @@ import pytest
 from isp_images import MIPI, QUAD, images, linear, mosaic_of, psnr
 
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
+from hesim_render.isp import balance, chart, colour, denoise, fill, levels, tone
 from hesim_render.isp.frame_noise import FrameNoise
 from hesim_render.isp.steps import BlackLevel, ColourMatrix, Denoise, Development, WhiteBalance
 from hesim_render.spectral import transfer
@@ -238,13 +238,13 @@ def test_noise_reduction_lowers_noise_and_keeps_edges():
     clean = np.full((128, 128, 3), 0.1, dtype=np.float32)
     clean[:, 64:] = [0.6, 0.4, 0.5]
     noisy = clean + RNG.normal(0, 0.01, clean.shape).astype(np.float32)
-    found = smooth.reduce_noise(noisy, luma=0.02, chroma=0.05)
+    found = denoise.reduce_noise(noisy, luma=0.02, chroma=0.05)
     assert found[20:108, 20:44].std(axis=(0, 1)).max() < 0.5 * 0.01
     assert found[20:108, 84:108].std(axis=(0, 1)).max() < 0.5 * 0.01
     np.testing.assert_allclose(found.mean((0, 1)), noisy.mean((0, 1)), rtol=0.01)
     step = found[:, 66].mean(0) - found[:, 61].mean(0)
     np.testing.assert_allclose(step, [0.5, 0.3, 0.4], rtol=0.06)
-    np.testing.assert_allclose(smooth.reduce_noise(noisy, 0, 0), noisy, atol=1e-6)
+    np.testing.assert_allclose(denoise.reduce_noise(noisy, 0, 0), noisy, atol=1e-6)
     assert psnr(found, clean) > psnr(noisy, clean) + 4
 
 
@@ -252,7 +252,7 @@ def test_colour_is_smoothed_over_twice_the_radius():
     """An even brightness guides nothing: two means over 2 · 2 · 3 + 1 pixels reach 12 pixels far."""
     root = np.full((41, 49, 3), 0.5, np.float32)
     root[20, 24] += [0.06, -0.02, -0.04]
-    found = to_root(smooth.reduce_noise(from_root(root), luma=0, chroma=0.05, radius_px=3)) - 0.5
+    found = to_root(denoise.reduce_noise(from_root(root), luma=0, chroma=0.05, radius_px=3)) - 0.5
     row, col = np.nonzero(np.abs(found).max(axis=2) > 1e-5)
     assert (row.min(), row.max(), col.min(), col.max()) == (8, 32, 12, 36)
 
@@ -271,7 +271,7 @@ def test_a_patch_is_as_far_to_each_side_of_its_centre():
 def test_guided_filter_against_its_definition():
     """One pixel by hand: mean of the linear models of all windows that cover it."""
     image, guide = RNG.random((2, 15, 15)).astype(np.float32)
-    found = smooth.guided_filter(image, guide, 1, 0.01)[7, 7]
+    found = denoise.guided_filter(image, guide, 1, 0.01)[7, 7]
     models = []
     for y in range(6, 9):
         for x in range(6, 9):
@@ -282,7 +282,7 @@ def test_guided_filter_against_its_definition():
     assert found == pytest.approx(a * guide[7, 7] + b, abs=1e-5)
     for radius_px, epsilon in ((0, 0.01), (1, 0.0)):
         with pytest.raises(RangeError, match="radius_px, epsilon"):
-            smooth.guided_filter(image, guide, radius_px, epsilon)
+            denoise.guided_filter(image, guide, radius_px, epsilon)
 
 
 @pytest.mark.parametrize("name", ["srgb", "bt709", "gamma", "linear"])

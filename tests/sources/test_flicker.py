@@ -12,12 +12,11 @@ from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.flicker import FlickerFlux
-from hesim_render.sources.light_parts import light_parts
 from hesim_render.sources.protocol import Sample
 from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.renderer import flickering
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
-from hesim_render.sources.scene import Scene
+from hesim_render.sources.scene import Scene, light_parts
 from hesim_render.sources.still import WindowByWindow
 from hesim_render.spectral.waveform import Mains, Pwm
 

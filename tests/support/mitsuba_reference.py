@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import RangeError
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.light_parts import light_parts
-from hesim_render.sources.scene import Scene
+from hesim_render.sources.scene import Scene, light_parts
 
 VARIANT = "scalar_spectral"
 #: Number of independent renders, whose scatter gives the error; and of the pilot, which decides their length.

@@ -14,14 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.light_parts import light_parts
 from hesim_render.sources.render.camera import MITSUBA_AXES, View, place_camera
 from hesim_render.sources.render.exact import used_responses
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba, spectrum_dict, transform
 from hesim_render.sources.render.scene.parents import camera_trajectory
-from hesim_render.sources.scene import Scene
+from hesim_render.sources.scene import Scene, light_parts
 
 #: Effects that Mitsuba's cameras have, or that are factors on their pictures.
 _MITSUBA_HAS = ("relative_illumination", "depth_of_field")

@@ -7,7 +7,7 @@ from scipy import integrate
 
 from hesim_render.specs.target import TargetSpec
 from hesim_render.targets.build import build_target
-from hesim_render.targets.leaves import leaves_picture
+from hesim_render.targets.resolution import leaves_picture
 
 GREYS = (0.1, 0.7)
 

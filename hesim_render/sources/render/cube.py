@@ -24,12 +24,11 @@ from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.lens import Lens
 from hesim_render.sensor.reading import read_sensor
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.light_parts import light_parts
 from hesim_render.sources.render.exact import timeline_of
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.scene.scene_spectra import named_spectra
 from hesim_render.sources.render.tracer import PixelTracer
-from hesim_render.sources.scene import Scene, scene_and_sensor
+from hesim_render.sources.scene import Scene, light_parts, scene_and_sensor
 from hesim_render.spectral.spectrum import RENDERABLE_NM
 from hesim_render.spectral.waveform import Waveform
 from hesim_render.targets.cube_file import RADIANCE_UNITS

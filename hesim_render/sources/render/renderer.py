@@ -9,11 +9,10 @@ from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.flicker import FlickerFlux
-from hesim_render.sources.light_parts import light_parts
 from hesim_render.sources.protocol import AuditableFlux
 from hesim_render.sources.render.camera import View
 from hesim_render.sources.renderer import Demand, Estimate, Renderer
-from hesim_render.sources.scene import Scene
+from hesim_render.sources.scene import Scene, light_parts
 from hesim_render.spectral.waveform import Waveform
 
 

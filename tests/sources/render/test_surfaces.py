@@ -9,9 +9,9 @@ from rendering import d65_irradiance, electrons_per_s, flux_image, make_scene, m
 
 import hesim_render as hr
 from hesim_render.core.errors import SpecError
-from hesim_render.sources.light_parts import light_parts
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
+from hesim_render.sources.scene import light_parts
 
 CAMERA = {"origin_m": [0, 0, 2], "target_m": [0, 0, 0], "horizontal_fov_deg": 22.62}
 SKY = {"type": "uniform", "illuminant": {"flat": 1.0, "band_nm": (300, 900)}, "irradiance_w_m2": np.pi * 600}
