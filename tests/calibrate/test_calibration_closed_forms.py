@@ -19,7 +19,9 @@ from hesim_render.calibrate.aps.composite import Composite, signal_at_event_pixe
 from hesim_render.calibrate.aps.dark import fit_dark
 from hesim_render.calibrate.aps.photon_transfer import _read_noise, linearity, system_gain
 from hesim_render.calibrate.aps.variance import Pooled, fit_variance, join, pool
+from hesim_render.calibrate.asynchronous import defects as asynchronous_defects
 from hesim_render.calibrate.asynchronous.likelihood import correlation
+from hesim_render.calibrate.asynchronous.trials import Parts
 from hesim_render.calibrate.estimate import Spread, estimated
 from hesim_render.calibrate.evs import checks as event_checks
 from hesim_render.calibrate.evs import counts, dispersion
@@ -36,6 +38,7 @@ from hesim_render.calibrate.evs.model import from_natural, natural
 from hesim_render.calibrate.evs.output import _gauge
 from hesim_render.calibrate.evs.steps import GROUPS, Steps
 from hesim_render.calibrate.evs.thresholds import Thresholds, curve
+from hesim_render.calibrate.flicker import dynamics
 
 BETA = np.array([4.0, 0.3, 20.0, 2e-5, 0.05, 30.0])  # 1, I, t, I², I t, t²
 FRAMES, TAU = 16, 6.0
@@ -645,3 +648,21 @@ def test_signals_of_event_pixels_are_those_of_the_reference_exposure(tmp_path, m
     captures = SimpleNamespace(folder=tmp_path, spec=SimpleNamespace(signal_reference=reference))
     found = counts._composite_signal(captures, tmp_path / "c.yaml", tmp_path / "evs_static.npz")
     np.testing.assert_allclose(found, [[8.4, 0.0], [np.nan, 0.56]], rtol=1e-6)
+
+
+def test_a_pixel_silent_in_no_trial_while_it_fires_has_a_rate_of_half_a_silent_trial():
+    parts, trials, trial_s = 40, 24, 0.05
+    disturbed = np.zeros((parts, 3), np.int64)
+    disturbed[5:17, 1] = disturbed[23:35, 1] = trials  # fires in all trials of 24 parts of 40
+    disturbed[::7, 2] = 1  # a good pixel with an event now and then
+    bad = np.array([False, True, False])
+    own_hz = np.array([[6.0], [2.0]])  # three of four events are ON
+    found = Parts(disturbed, trials, trial_s)
+    rates, share, change_hz = asynchronous_defects._flicker(bad, np.array([1]), found, own_hz)
+    usual = disturbed[:, [0, 2]].mean() / trials
+    expected_share, correlation = dynamics(disturbed[:, [1]], trials, usual)
+    assert share == expected_share and 0.5 < share[0] < 0.7
+    assert disturbed[:, 1].mean() / trials - usual > 0.99 * share[0]  # no silent trial was seen
+    total = -np.log(0.5 / (parts * trials * share[0])) / trial_s
+    np.testing.assert_allclose(rates[:, 0], [0.75 * total, 0.25 * total], rtol=1e-12)
+    np.testing.assert_allclose(change_hz, -np.log(correlation) / trial_s, rtol=1e-12)
