@@ -25,6 +25,31 @@ from hesim_render.core.progress import Progress
 from hesim_render.specs.benchmark import SPLITS
 
 Summary = dict[str, dict[str, dict[str, dict[str, float]]]]
+#: Of each task: the method that does nothing, the measure that decides, and 1 where more of it is better, else −1.
+NOTHING = {
+    "deblur": ("blurred", "raw_psnr_db", 1),
+    "interpolate": ("hold", "raw_psnr_db", 1),
+    "denoise": ("none", "f1", 1),
+    "fidelity": ("none", "chamfer_px", -1),
+    "flow": ("zero", "epe_px", -1),
+    "hdr": ("shortest", "psnr_mu_db", 1),
+}
+#: Why a method may lose; ``{nothing}`` is the mean of doing nothing.
+_WHY = {
+    "deblur": "doing nothing has {nothing:.3g} dB because little blurs, so there is little to gain, and a method adds "
+    "errors everywhere",
+    "interpolate": "doing nothing has {nothing:.3g} dB because little changes from frame to frame, and a method adds "
+    "errors everywhere",
+    "denoise": "F1 of {nothing:.3g} without a filter says that many events are signal, of which a filter drops more "
+    "than it gains by the noise that it drops",
+    "fidelity": "the events are {nothing:.3g} px from the true ones without a filter, and signal that a filter drops "
+    "moves them away",
+    "flow": "pixels move by {nothing:.3g} px in the mean, which is the error of zero; a method is wrong also where "
+    "nothing moves",
+    "hdr": "the shortest exposure has {nothing:.3g} dB; what moves between exposures leaves ghosts in a merge",
+}
+#: Methods that count a threshold for each event.
+_INTEGRALS = ("double-integral",)
 
 
 def evaluate_benchmark(
@@ -157,37 +182,6 @@ def score_table(result: Summary) -> str:
             cells = [values[name].get("mean") if name in values else None for name in names]
             lines.append(f"  {method:<18}" + "".join(f"{'–' if c is None else f'{c:.4g}':>15}" for c in cells))
     return "\n".join(lines)
-
-
-#: Of each task: the method that does nothing, the measure that decides, and 1 where more of it is better, else −1.
-NOTHING = {
-    "deblur": ("blurred", "raw_psnr_db", 1),
-    "interpolate": ("hold", "raw_psnr_db", 1),
-    "denoise": ("none", "f1", 1),
-    "fidelity": ("none", "chamfer_px", -1),
-    "flow": ("zero", "epe_px", -1),
-    "hdr": ("shortest", "psnr_mu_db", 1),
-}
-
-
-#: Why a method may lose; ``{nothing}`` is the mean of doing nothing.
-_WHY = {
-    "deblur": "doing nothing has {nothing:.3g} dB because little blurs, so there is little to gain, and a method adds "
-    "errors everywhere",
-    "interpolate": "doing nothing has {nothing:.3g} dB because little changes from frame to frame, and a method adds "
-    "errors everywhere",
-    "denoise": "F1 of {nothing:.3g} without a filter says that many events are signal, of which a filter drops more "
-    "than it gains by the noise that it drops",
-    "fidelity": "the events are {nothing:.3g} px from the true ones without a filter, and signal that a filter drops "
-    "moves them away",
-    "flow": "pixels move by {nothing:.3g} px in the mean, which is the error of zero; a method is wrong also where "
-    "nothing moves",
-    "hdr": "the shortest exposure has {nothing:.3g} dB; what moves between exposures leaves ghosts in a merge",
-}
-
-
-#: Methods that count a threshold for each event.
-_INTEGRALS = ("double-integral",)
 
 
 def verdicts(scores: Sequence[Score], ticked: Collection[str] = ()) -> list[str]:

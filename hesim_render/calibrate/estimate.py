@@ -13,6 +13,8 @@ from scipy.stats import t as student
 
 #: Half width of a 95 % interval of a normal law, in standard errors.
 Z_95 = 1.959963984540054
+#: Probability that one check gives a finding for captures that follow the model.
+ALARM = 1e-4
 
 
 def estimated(value: float, standard_error: float, unit: str = "", groups: int | None = None) -> dict[str, Any]:
@@ -75,10 +77,6 @@ class Spread:
             return estimated(self.value, self.error, "relative std", self.groups)
         note = "the pixels scatter no more than counting makes them"
         return {"value": 0.0, "upper_limit": self.limit, "note": note}
-
-
-#: Probability that one check gives a finding for captures that follow the model.
-ALARM = 1e-4
 
 
 @dataclass(frozen=True)

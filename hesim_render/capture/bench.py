@@ -34,6 +34,8 @@ _DARKEST = 10 ** (-_DENSITY_STEP * _PATCHES)
 _BRIGHTEST = 0.9
 #: Brightest event signal of a sensor without frames, in DN of the signal reference.
 _BRIGHTEST_EVENT_DN = 1000.0
+#: Most charge of the dark current in the longest exposure, as a part of saturation, at which that is compared.
+_DARK_PART = 2e-3
 
 
 def step_target(rows: int, cols: int) -> NDArray[np.float64]:
@@ -136,10 +138,6 @@ def set_up(
     else:
         lux = _BRIGHTEST_EVENT_DN / float(bench.event_signal_dn.max())
     return Bench(sensor, flux * lux, lux, aps, evs)
-
-
-#: Most charge of the dark current in the longest exposure, as a part of saturation, at which that is compared.
-_DARK_PART = 2e-3
 
 
 def truth_of(bench: Bench, longest_us: float) -> dict[str, dict[str, float]]:

@@ -14,6 +14,13 @@ from hesim_render.recording.truth_file import truth_kinds
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.specs.lens import LENS_TERMS
 
+#: Models of frame pixels and of event pixels; None for the kind that a sensor lacks.
+Noise = tuple[ApsNoise | None, EvsNoise | None]
+#: Names of all noise terms that can be switched off.
+NOISE_TERMS = (*(f"aps.{term}" for term in APS_TERMS), *(f"evs.{term}" for term in EVS_TERMS))
+#: Names of all that can be switched off in a render: noise terms, and effects of the lens.
+TERMS = (*NOISE_TERMS, *LENS_TERMS)
+
 
 class RunOptions(TypedDict, total=False):
     """The fields of `RunSettings`, as keywords of `simulate`."""
@@ -131,18 +138,6 @@ def require_seed(seed: int) -> None:
     """Refuse a seed that the generator does not take."""
     if not 0 <= seed < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
-
-
-#: Models of frame pixels and of event pixels; None for the kind that a sensor lacks.
-Noise = tuple[ApsNoise | None, EvsNoise | None]
-
-
-#: Names of all noise terms that can be switched off.
-NOISE_TERMS = (*(f"aps.{term}" for term in APS_TERMS), *(f"evs.{term}" for term in EVS_TERMS))
-
-
-#: Names of all that can be switched off in a render: noise terms, and effects of the lens.
-TERMS = (*NOISE_TERMS, *LENS_TERMS)
 
 
 def noise_models(

@@ -14,6 +14,10 @@ from typing import Any
 
 from hesim_render.core.output import discard_unfinished
 
+#: Time for Python to end the run itself, s.
+GRACE_S = 1.2
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
 
 class ExitStatus(IntEnum):
     """What a command ends with. A traceback with status 1 is a fault of this program."""
@@ -23,13 +27,6 @@ class ExitStatus(IntEnum):
     REFUSED = 2
     NOT_MET = 3
     INTERRUPTED = 130
-
-
-#: Time for Python to end the run itself, s.
-GRACE_S = 1.2
-
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupts:

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 
+#: Length of the JSON text that comes first; the data of the arrays follow it in order.
+_LENGTH = struct.Struct("<Q")
+
 
 class PlainState:
     """Base of a dataclass whose cached properties are left out of pickles and copies.
@@ -36,10 +39,6 @@ def finite(node: Any) -> Any:
     if isinstance(node, float):
         return node if np.isfinite(node) else None
     return node
-
-
-#: Length of the JSON text that comes first; the data of the arrays follow it in order.
-_LENGTH = struct.Struct("<Q")
 
 
 def to_bytes(value: Any) -> bytes:

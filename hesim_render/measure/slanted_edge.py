@@ -36,6 +36,8 @@ _LEAST_PIXELS, _LEAST_HALF_WIDTH_PX = 64, 4.0
 _TAPER = 0.2
 #: Pixels nearest to the edge that decide its place, at most.
 _MOST_FITTED = 60_000
+#: What is measured: RAW values, or the noise-free electrons of the truth.
+Signal = Literal["raw", "electrons"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,10 +224,6 @@ def _fading(count: int) -> NDArray[np.float64]:
     from scipy.signal.windows import tukey
 
     return tukey(count + 2, 2 * _TAPER)[1:-1]
-
-
-#: What is measured: RAW values, or the noise-free electrons of the truth.
-Signal = Literal["raw", "electrons"]
 
 
 def measure_mtf(

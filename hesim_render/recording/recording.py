@@ -22,6 +22,11 @@ from hesim_render.recording.truth_file import TRUTH_FILE, TruthRequest, write_tr
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+#: Share of the pixels of a frame that is judged as dark where its signal is below the read noise.
+_DARK_SHARE = 0.99
+#: Share of saturated pixels that gives a warning.
+_WHITE_SHARE = 0.5
+
 
 class Recording(Recorded):
     """Frames, events and manifest of one run.
@@ -165,14 +170,6 @@ def _save_truth(recording: Recorded, writer: FolderWriter) -> None:
             writer.set_event_objects(recording.truth.objects_at)
     if request.geometry:
         writer.write_in(TRUTH_FILE, lambda path: write_truth(path, recording.truth, request))
-
-
-#: Share of the pixels of a frame that is judged as dark where its signal is below the read noise.
-_DARK_SHARE = 0.99
-
-
-#: Share of saturated pixels that gives a warning.
-_WHITE_SHARE = 0.5
 
 
 def warn_of_exposure(recording: Recording) -> Recording:

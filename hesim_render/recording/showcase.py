@@ -38,6 +38,8 @@ WINDOW_US = 10_000
 _ANIMATION_STEPS = 30
 _ANIMATION_WIDTH_PX = 640
 _ZOOM = 8
+#: Colour codes red, green and blue.
+_THREE = 3
 
 
 def write_previews(recording: Recorded, folder: Path) -> list[Path]:
@@ -170,10 +172,6 @@ def _ms(microseconds: int) -> str:
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
-#: Colour codes red, green and blue.
-_THREE = 3
 
 
 def write_preview_dng(path: Path, frame: Frame, mosaic: Mosaic) -> None:

@@ -27,6 +27,15 @@ from hesim_render.specs.sensor_checks import unused
 if TYPE_CHECKING:
     from hesim_render.specs.frame_pixels import ApsSpec
 
+#: Shortest exposure that is not doubted, µs: shutters of cameras take about 10 µs at least.
+_SHORTEST_US = 10
+#: Ratio of the ADC's range to the full well, either way, from which one of them is doubted.
+_MOST_APART = 10.0
+#: Parts of the full well above which read noise and dark current are doubted, and of the ADC's range for the black.
+_MOST_NOISE, _MOST_DARK, _MOST_BLACK = 0.1, 0.5, 0.5
+#: Contrasts of thresholds that are not doubted.
+_CONTRASTS = (0.01, 10.0)
+
 
 class SensorFile(NamedTuple):
     """What a sensor file says.
@@ -127,22 +136,6 @@ def _tell_doubts(spec: SensorSpec, data: CommentedMap, file: Path, changes: Mapp
     for key, text in doubts(spec):
         known = None if key in changes else line_of(data, key.split("."))
         warnings.warn(str(SpecError(text, file=file, line=known, key=key)), HesimWarning, stacklevel=4)
-
-
-#: Shortest exposure that is not doubted, µs: shutters of cameras take about 10 µs at least.
-_SHORTEST_US = 10
-
-
-#: Ratio of the ADC's range to the full well, either way, from which one of them is doubted.
-_MOST_APART = 10.0
-
-
-#: Parts of the full well above which read noise and dark current are doubted, and of the ADC's range for the black.
-_MOST_NOISE, _MOST_DARK, _MOST_BLACK = 0.1, 0.5, 0.5
-
-
-#: Contrasts of thresholds that are not doubted.
-_CONTRASTS = (0.01, 10.0)
 
 
 def doubts(spec: SensorSpec) -> Iterator[tuple[str, str]]:

@@ -27,6 +27,11 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 
 #: Grid of the sums below, fine enough for pictures (radiometry integrates in `spectrum`).
 _GRID_NM = np.arange(360.0, 831.0, 1.0)
+#: L*, a* and b*, or X, Y and Z.
+Triple: TypeAlias = tuple[Values, Values, Values]
+#: Ratio to white below which CIELAB is linear (CIE 15).
+_LINEAR_BELOW = (24 / 116) ** 3
+_DEGREE = pi / 180
 
 
 def responses_to(
@@ -70,17 +75,6 @@ def _srgb_table() -> NDArray[np.uint8]:
 
 
 _SRGB_TABLE = _srgb_table()
-
-
-#: L*, a* and b*, or X, Y and Z.
-Triple: TypeAlias = tuple[Values, Values, Values]
-
-
-#: Ratio to white below which CIELAB is linear (CIE 15).
-_LINEAR_BELOW = (24 / 116) ** 3
-
-
-_DEGREE = pi / 180
 
 
 def lab_of(ratios: Triple, xp: Namespace = NUMPY) -> Triple:

@@ -31,6 +31,8 @@ from hesim_render.targets.opened_cube import CubeFile
 
 #: Most pictures of demosaiced patterns that a study keeps.
 MOST_PICTURES = 48
+#: Pairs of surfaces with at most this difference of L*, and at least this one of colour, are isoluminant.
+_SAME_LIGHTNESS, _OTHER_COLOUR = 5.0, 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,10 +171,6 @@ def _detail(
         electrons(white_rate(every, light, lux), exposure_us), exposure_us, seen.candidate.crosstalk,
         spec.noise.repeats, spec.noise.seed,
     )  # fmt: skip
-
-
-#: Pairs of surfaces with at most this difference of L*, and at least this one of colour, are isoluminant.
-_SAME_LIGHTNESS, _OTHER_COLOUR = 5.0, 20.0
 
 
 def tile_event_figures(

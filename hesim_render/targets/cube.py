@@ -20,6 +20,10 @@ from hesim_render.targets.piece import Picture, TargetPiece, picture_piece
 
 #: Ends of the names of files with hyperspectral cubes.
 _CUBES = tuple(CUBE_READERS)
+#: Wavelengths up to which the first and the last plane of a cube are held, nm; all responses lie between them.
+_HELD_NM = (300.0, 1100.0)
+#: Values above 1 by rounding.
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +117,6 @@ READERS: dict[str, Callable[[Path], Cube]] = {
     ".tiff": _codes,
     ".exr": _exr,
 }
-
-
-#: Wavelengths up to which the first and the last plane of a cube are held, nm; all responses lie between them.
-_HELD_NM = (300.0, 1100.0)
-
-
-#: Values above 1 by rounding.
-_ROUNDING = 1e-6
 
 
 def image(target: ImageTarget) -> list[TargetPiece]:

@@ -32,6 +32,8 @@ _RIM_STEP_RAD = radians(0.5)
 #: Texels per period of the finest rings of a zone plate. Between texels the reflectance is linear, so that at this
 #: frequency the amplitude is too small by (π/24)²/3 = 0.6 % on average over places.
 _TEXELS_PER_CYCLE = 24
+#: Leaves drawn at a time.
+_BATCH = 4096
 
 
 def slanted_edge(target: SlantedEdgeTarget) -> list[TargetPiece]:
@@ -181,10 +183,6 @@ def zone_plate(target: ZonePlateTarget) -> list[TargetPiece]:
     middle = (target.reflectance_max + target.reflectance_min) / 2
     values = middle + (target.reflectance_max - target.reflectance_min) / 2 * np.cos(phase)
     return [picture_piece("rings", Picture(values.astype(np.float32)[..., None], "grey"), w, h)]
-
-
-#: Leaves drawn at a time.
-_BATCH = 4096
 
 
 def dead_leaves(target: DeadLeavesTarget) -> list[TargetPiece]:

@@ -48,6 +48,16 @@ THETA, MISMATCH, RESPONSE, SHOT, DARK, CUTOFF, LEAK = (0, 1), (2, 3), 4, 5, 6, 7
 _NODES, _SPREADS, _LEAST_REACH = 97, 6.0, 0.05
 #: Least probability of an outcome, so that no single trial excludes a threshold, and least noise in thresholds.
 _LEAST_CHANCE, _LEAST_NOISE = 1e-9, 1e-3
+#: ln κ against the level h in standard deviations, highest power first, between two ends of h; 0.4 % off the counts.
+_LOG_KAPPA = (-3.1165e-05, 3.6215e-04, -4.6413e-04, -4.4709e-03, -0.027395, 0.34284, -0.92856, 0.61716)
+_LOWEST, _HIGHEST, _SLOPE = -1.5, 6.0, -2.112  # below, ln κ goes on along its slope there
+#: Fraction of a period of the cut-off in which the noise stays as at the reset and cannot pass a threshold.
+_REMEMBERED = 0.15
+#: Gauss–Hermite nodes and weights of the noise at the reset, in standard deviations.
+_Z, _Z_WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
+_Z_WEIGHTS = _Z_WEIGHTS / _Z_WEIGHTS.sum()
+#: Level that noise never reaches, in standard deviations.
+_FAR = 30.0
 
 
 def threshold_grid(theta: float, mismatch: float) -> NDArray[np.float64]:
@@ -168,28 +178,6 @@ class Likelihood:
             logsumexp(g + log_prior(values[THETA[k]], values[MISMATCH[k]], self.grids[k]), axis=1)
             for k, g in enumerate(given)
         )  # type: ignore[return-value]
-
-
-#: ln κ against the level h in standard deviations, highest power first, between two ends of h; 0.4 % off the counts.
-_LOG_KAPPA = (-3.1165e-05, 3.6215e-04, -4.6413e-04, -4.4709e-03, -0.027395, 0.34284, -0.92856, 0.61716)
-
-
-_LOWEST, _HIGHEST, _SLOPE = -1.5, 6.0, -2.112  # below, ln κ goes on along its slope there
-
-
-#: Fraction of a period of the cut-off in which the noise stays as at the reset and cannot pass a threshold.
-_REMEMBERED = 0.15
-
-
-#: Gauss–Hermite nodes and weights of the noise at the reset, in standard deviations.
-_Z, _Z_WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
-
-
-_Z_WEIGHTS = _Z_WEIGHTS / _Z_WEIGHTS.sum()
-
-
-#: Level that noise never reaches, in standard deviations.
-_FAR = 30.0
 
 
 def passage_rate(level: NDArray) -> NDArray[np.float64]:

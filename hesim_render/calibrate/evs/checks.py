@@ -32,6 +32,10 @@ _LEAST_FLOOR, _LEAST_LOSS = 1e-5, 1e-3
 _MODEL_ERROR = 0.02
 #: Distance in standard errors above which two searches end at different points.
 _APART = 0.3
+#: Rounds, and the part of a parameter below which a change ends them.
+_ROUNDS, _ENOUGH = 30, 1e-7
+#: Least variance of a rate, also of steps without any event, so that no single event decides.
+_LEAST_VARIANCE = 1e-5
 
 
 def check_events(result: EvsCalibration, contrast_of: str) -> tuple[list[Finding], CurveLevels | None]:
@@ -151,14 +155,6 @@ def _width(result: EvsCalibration, contrast_of: str) -> Finding | None:
         "with longer tails than a normal law, events without a change, or steps captured at another light or bias.",
         p_value,
     )
-
-
-#: Rounds, and the part of a parameter below which a change ends them.
-_ROUNDS, _ENOUGH = 30, 1e-7
-
-
-#: Least variance of a rate, also of steps without any event, so that no single event decides.
-_LEAST_VARIANCE = 1e-5
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,9 @@ from hesim_render.pixels.evs.comparison import LastEvent, PreviousSample
 from hesim_render.pixels.evs.defects import DefectEvents
 from hesim_render.pixels.evs.model import EvsNoise
 
+#: Rows by which the start of the scan moves per microsecond, as a fraction of all rows: the golden section × 2³².
+_GOLDEN = 2654435769
+
 
 class _Mode(Protocol):
     def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
@@ -169,10 +172,6 @@ class EvsStage:
         if self._labels is not None:
             self._labels.take(self, electrons, events, origin, kept)
         return events if kept is None else events[kept]
-
-
-#: Rows by which the start of the scan moves per microsecond, as a fraction of all rows: the golden section × 2³².
-_GOLDEN = 2654435769
 
 
 def scan_start_row(t_us: NDArray[np.int64], rows: int) -> NDArray[np.int64]:
