@@ -1,6 +1,7 @@
 """A recording, and what can be made of it: a folder, files of other programs, drawings.
 
-The content is in `recorded`. Each method here calls a function over it, which is loaded with the first call.
+The content is in `recorded`. The methods here call functions over it; what draws or exports is loaded with the first
+call.
 """
 
 from __future__ import annotations
@@ -91,7 +92,6 @@ class Recording(Recorded):
         OutputError
             If the folder exists (and `overwrite` is not set) or cannot be written.
         """
-
         return save(self, path, overwrite)
 
     def export(self, format: str, path: str | Path, overwrite: bool = False) -> Path:
