@@ -32,6 +32,7 @@ from hesim_render.calibrate.evs.cells import PixelThresholds, pool_events
 from hesim_render.calibrate.evs.checks import curve_levels
 from hesim_render.calibrate.evs.counts import StaticCapture
 from hesim_render.calibrate.evs.defects import bad_event_pixels, bad_in_steps
+from hesim_render.calibrate.evs.defects import classify as classify_event_defects
 from hesim_render.calibrate.evs.fitted import fit_events
 from hesim_render.calibrate.evs.medians import middle_and_spread
 from hesim_render.calibrate.evs.model import from_natural, natural
@@ -39,6 +40,7 @@ from hesim_render.calibrate.evs.output import _gauge
 from hesim_render.calibrate.evs.steps import GROUPS, Steps
 from hesim_render.calibrate.evs.thresholds import Thresholds, curve
 from hesim_render.calibrate.flicker import dynamics
+from hesim_render.calibration.spec import Defect
 
 BETA = np.array([4.0, 0.3, 20.0, 2e-5, 0.05, 30.0])  # 1, I, t, I², I t, t²
 FRAMES, TAU = 16, 6.0
@@ -666,3 +668,24 @@ def test_a_pixel_silent_in_no_trial_while_it_fires_has_a_rate_of_half_a_silent_t
     total = -np.log(0.5 / (parts * trials * share[0])) / trial_s
     np.testing.assert_allclose(rates[:, 0], [0.75 * total, 0.25 * total], rtol=1e-12)
     np.testing.assert_allclose(change_hz, -np.log(correlation) / trial_s, rtol=1e-12)
+
+
+def test_a_flickering_pixel_has_the_chance_of_the_time_in_which_it_fires():
+    parts, trials = 40, 9600
+    few = np.full((24, 24), 2)
+    on, of_parts = few.copy(), np.zeros((parts, 24, 24), np.int64)
+    of_parts[::20] = 2  # good pixels: two events of either polarity in all
+    fires = np.repeat([0, 1, 0, 1, 0], 8) == 1
+    of_parts[fires, 5, 7] = 72  # 0.3 of 240 trials, in 16 of 40 parts
+    on[5, 7] = of_parts[:, 5, 7].sum()
+    static = StaticCapture(np.full(few.shape, 50.0), on, few, on, few, trials, (1, 1), of_parts)
+    bad = np.zeros(few.shape, bool)
+    bad[5, 7] = True
+    found = classify_event_defects(static, bad, None)
+    assert found.kind[5, 7] == Defect.FLICKERING and found.count(Defect.NONE) == bad.size - 1
+    assert found.firing_share[5, 7] == pytest.approx(0.4, rel=0.03)
+    assert found.on[5, 7] == pytest.approx(0.3, rel=0.03) and found.off[5, 7] == 0
+    assert 0.9 < found.correlation[5, 7] < 1
+    assert (
+        np.all(found.on[~bad] == 0) and np.all(found.firing_share[~bad] == 1) and np.all(found.correlation[~bad] == 0)
+    )
