@@ -59,6 +59,7 @@ def test_dark_and_overexposed_frames_are_told():
         assert warn_of_exposure(recording) is recording
     mean = frame.electrons_mean.copy()
     frame.electrons_mean[valid] = 3.0
+    frame.electrons_mean[tuple(axis[0] for axis in valid.nonzero())] = 0.0  # of one pixel: no light is that of all
     with pytest.warns(HesimWarning, match=r"frame 1, .*nearly dark: 99 % .* fewer than 3 e⁻, at a read noise of 5 e⁻"):
         warn_of_exposure(recording)
     for electrons in (5.1, 0.0):  # more than the read noise; no light at all is meant
