@@ -9,7 +9,7 @@ from hesim_render.mosaic.schedule import tick_blocks
 from hesim_render.sources.protocol import Sample
 from hesim_render.sources.render.audit import audit as audit_module
 from hesim_render.sources.render.audit.audit import STRETCHES, Audit
-from hesim_render.sources.render.audit.compare import compare_crossings, compare_ticks
+from hesim_render.sources.render.audit.compare import Tally, compare_crossings, compare_ticks
 from hesim_render.sources.render.audit.confidence import lower_bound, ratio_upper_bound, upper_bound
 from hesim_render.sources.render.audit.units import NotedFlux
 
@@ -349,3 +349,22 @@ def test_flips_are_those_that_both_errors_cause(monkeypatch):
     found = Audit(noted, source, QUALITY, sensor.evs, pixels, 3).run()["events"]
     assert found["flips"] * found["true_events"] > 5000
     assert found["flips_by_stated_error"] == pytest.approx(found["flips"], rel=0.06)
+
+
+def test_a_rate_weighs_units_with_events_and_without_by_how_many_of_each_were_examined():
+    """Units with events are examined further than others: each kind is a mean over its own first part."""
+    tally = Tally(7)
+    tally.has_event[[0, 3, 5]] = True
+    tally.eventful, tally.looked_at = 5, 3
+    values = np.array([2.0, 0.5, 0.25, 4.0, 16.0, 32.0, 64.0])
+    assert tally.rate(values) == pytest.approx((2.0 + 4.0) / 5 + (0.5 + 0.25) / 3, rel=1e-12)
+    assert Tally(4).rate(np.ones(4)) == 0  # nothing was examined
+
+
+def test_deviations_are_those_of_units_that_were_all_examined():
+    tally = Tally(4)
+    tally.looked_at = 2
+    tally.note(np.array([0, 3]), np.array([[3.0, 9.0], [1.0, 8.0]]), np.array([0.5, 7.0]))
+    tally.note(np.array([1]), np.array([[2.0]]), np.array([0.25]))
+    deviation, weight = tally.deviations()
+    assert deviation.tolist() == [1.0, 2.0, 3.0] and weight.tolist() == [0.5, 0.25, 0.5]
