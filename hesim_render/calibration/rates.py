@@ -1,8 +1,8 @@
 """Rates of pixels that misbehave, per second, from what captures tell: chances per comparison, correlations per frame.
 
-A calibration holds rates per second, so that a sensor behaves the same at any tick and frame rate. Older calibrations,
-and those of captures whose interval nobody stated, hold values per interval. They are converted with the interval that
-the section states (`tick_us`, `frame_rate_hz`), else with that of the sensor file that names the calibration.
+A calibration holds rates per second, so that a sensor behaves the same at any tick and frame rate. Those of
+captures whose interval nobody stated hold values per interval. They are converted with the interval that the section
+states (`tick_us`, `frame_rate_hz`), else with that of the sensor file that names the calibration.
 
 `EventDefectRates` and `TelegraphRates` are the rates of a sensor; ``…PerTrial`` and ``…PerFrame`` are what captures
 tell. Each of them knows the names of its maps in the file.

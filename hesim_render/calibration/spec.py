@@ -105,7 +105,7 @@ class FrameSection(_Section):
     goodness: FrameGoodness
     black_dn: float
     n_row_std_dn: float = Field(ge=0)
-    row_noise_dn: EstimateSpec | None = Field(None, description="calibrations of before it was measured lack it")
+    row_noise_dn: EstimateSpec | None = Field(None, description="temporal noise of rows")
     column_noise_dn: EstimateSpec | None = Field(None, description="of captures of EMVA 1288 alone, as the next six")
     column_offset_std_dn: float | None = Field(None, ge=0)
     nonlinearity: list[float] | None = Field(None, min_length=3, max_length=3)
@@ -114,7 +114,7 @@ class FrameSection(_Section):
     responsivity: EstimateSpec | None = None
     quantum_efficiency: EstimateSpec | None = None
     bad_pixels: NonNegativeInt
-    telegraph_pixels: NonNegativeInt | None = Field(None, description="calibrations of before they were found lack it")
+    telegraph_pixels: NonNegativeInt | None = Field(None, description="where the captures tell it")
     K: EstimateSpec
     read_noise_e: EstimateSpec
     dark_current_e_per_s: EstimateSpec
@@ -124,7 +124,7 @@ class FrameSection(_Section):
     linearity_error_percent: EstimateSpec
     findings: list[FindingSpec] = []
     maps: MapsFile
-    frame_rate_hz: PositiveFloat | None = Field(None, description="of the captures; older calibrations lack it")
+    frame_rate_hz: PositiveFloat | None = Field(None, description="of the captures, where it is known")
 
     @property
     def interval_s(self) -> float | None:
@@ -169,13 +169,13 @@ class EventSection(EventParameters):
         None, description="missing where the period of the comparisons is not known"
     )
     tick_us: PositiveFloat | None = Field(
-        None, description="period of the comparisons of the captures, µs; older calibrations lack it"
+        None, description="period of the comparisons of the captures, µs, where it is known"
     )
     goodness: EventGoodness
     trials: PositiveInt
     bad_pixels: NonNegativeInt
     defects: dict[Literal["stuck", "hot", "flickering", "other"], NonNegativeInt] | None = Field(
-        None, description="bad pixels by what they do; calibrations of before they were named lack it"
+        None, description="bad pixels by what they do"
     )
     findings: list[FindingSpec] = []
     maps: MapsFile

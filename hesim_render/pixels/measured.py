@@ -36,7 +36,7 @@ _EXPECTED |= {
     "telegraph_change_hz": ("f", 1e9),
 }  # fmt: skip
 _THRESHOLD = ("fiu", 1e3)  # relative to the mean
-#: Maps that a calibration may lack: thresholds if no steps were shown; the others in older calibrations.
+#: Maps that a calibration may lack: thresholds if no steps were shown, telegraph noise and response by the kind of captures.
 _MAY_LACK = ("threshold_", "defect", "telegraph_", "response")
 
 
@@ -78,7 +78,7 @@ def frame_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
 
 def telegraph_rates(layout: Layout) -> TelegraphRates | None:
     """Random telegraph noise of each pixel of the region, [row, col]; None if not measured."""
-    # per second where the calibration has it; older ones, and those of captures without an interval, are per frame
+    # per second where the calibration has it; those of captures without an interval are per frame
     known = _all_of(TelegraphRates, layout, "aps", _frame_region)
     if known is not None:
         return known

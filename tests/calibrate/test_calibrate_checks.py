@@ -69,9 +69,9 @@ def test_the_sizes_of_drifts_are_told(tmp_path):
     # a ramp of 3 DN over 32 frames: 3·sqrt((1 − 1/32²)/12) rms; the mean over 4096 pixels is good to 0.03 DN
     assert section["drift"]["black_dn_rms"]["dark"] == pytest.approx(3 / np.sqrt(12), abs=0.05)
     section = frames_of(tmp_path / "b", light_ramp=0.02, ramp_over="exposure", size=96)
-    assert section["drift"]["light_rms"] == pytest.approx(0.02 / np.sqrt(12), abs=0.0015)
+    assert section["drift"]["light_rms_rel"] == pytest.approx(0.02 / np.sqrt(12), abs=0.0015)
     section = frames_of(tmp_path / "c", light_ramp=0.02)
-    deviation = section["drift"]["light_from_proportion"]
+    deviation = section["drift"]["light_from_proportion_rel"]
     # the light of exposure k is 1 + 0.02 (k + ½)/5: from 1 to 20 ms it rises by 1.6 %
     assert deviation[20000] - deviation[1000] == pytest.approx(0.016, abs=0.003)
 

@@ -82,10 +82,10 @@ def content(
                 name: max((d.black.rms if d.black.significant else 0.0 for d in drifts), default=0.0)
                 for name, drifts in (("dark", checks.dark), ("lit", checks.lit))
             },
-            "light_rms": max(
+            "light_rms_rel": max(
                 (d.light.rms for d in checks.lit if d.light is not None and d.light.significant), default=0.0
             ),
-            "light_from_proportion": {p.exposure_us: p.deviation for p in checks.proportions},
+            "light_from_proportion_rel": {p.exposure_us: p.deviation for p in checks.proportions},
             "black_from_dark_dn": {p.exposure_us: p.shift_dn for p in checks.proportions},
         },
         **result.transfer,
