@@ -151,7 +151,7 @@ def _evs_values(sensor: Mapping[str, Any], evs: EventSection, noise: NoiseFile) 
 
 
 def _leak_rate_hz(evs: EventSection, noise: NoiseFile) -> float:
-    """Rate of the leak: as stated, or where the tick of the captures is not known, from the chance of an event in a comparison."""
+    """Rate of the leak: as stated, or where the captures' tick is not known, from the chance in a comparison."""
     if evs.leak_rate_hz is not None:
         return max(0.0, evs.leak_rate_hz.value or 0.0)
     chance = max(0.0, evs.leak_per_trial.value or 0.0)

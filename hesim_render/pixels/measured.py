@@ -36,7 +36,7 @@ _EXPECTED |= {
     "telegraph_change_hz": ("f", 1e9),
 }  # fmt: skip
 _THRESHOLD = ("fiu", 1e3)  # relative to the mean
-#: Maps that a calibration may lack: thresholds if no steps were shown, telegraph noise and response by the kind of captures.
+#: Maps that a calibration may lack: thresholds if no steps were shown, others by the kind of captures.
 _MAY_LACK = ("threshold_", "defect", "telegraph_", "response")
 
 
