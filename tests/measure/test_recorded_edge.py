@@ -1,5 +1,6 @@
 """e-SFR of rendered edges against the product of closed forms, and the command that measures it."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -83,8 +84,10 @@ def test_one_filter_of_a_mosaic_is_measured_in_a_part_of_a_frame(recording):
     assert abs(raw.mtf[10] - expected[10]) < 0.05
     with pytest.raises(RangeError, match="say on which to measure"):
         measure_mtf(loaded)
-    with pytest.raises(RangeError, match=r"region is \(100, 0, 30, 30\)"):
-        measure_mtf(loaded, region=(100, 0, 30, 30), filter_name=known[0])
+    # beyond either side, and without an area
+    for region in ((100, 0, 30, 30), (0, 90, 20, 7), (-1, 0, 30, 30), (0, -1, 30, 30), (10, 0, 0, 30), (10, 0, 30, 0)):
+        with pytest.raises(RangeError, match=re.escape(f"region is {region}")):
+            measure_mtf(loaded, region=region, filter_name=known[0])
     with pytest.raises(RangeError, match="frame is 7; expected 0 to 0"):
         measure_mtf(loaded, 7, filter_name=known[0])
 
