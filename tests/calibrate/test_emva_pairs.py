@@ -332,7 +332,7 @@ def test_a_wrong_list_is_one_error_with_file_and_line(written, tmp_path, name):
 
 def test_captures_that_do_not_fit_into_memory_are_refused_before_a_frame_is_read(written, monkeypatch):
     monkeypatch.setattr("hesim_render.core.guard._machine_bytes", lambda: 36 * 52 * 100)
-    monkeypatch.setattr("hesim_render.recording.pair_set.read_raw", None)
+    monkeypatch.setattr("hesim_render.recording.pair_set.read_grey", None)
     with pytest.raises(SpecError, match=r"EMVA1288_Data\.txt: maps and transforms of a frame would take"):
         evaluate(read_pair_set(written))
 

@@ -39,6 +39,8 @@ from hesim_render.recording.pair_set import PairSet
 
 #: EMVA 1288 fits from 0 to this part of saturation.
 _FIT_TOP = 0.7
+#: Part of saturation at which it takes the long series.
+_LONG_AT = 0.5
 #: Scatter of the light from exposure to exposure that is refused.
 _MOST_SCATTER = MOST_CHANGE
 _FEWEST_CLEAR = 5
@@ -134,10 +136,11 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     """
     require_memory(_BYTES_PER_PIXEL * pairs.shape[0] * pairs.shape[1], "maps and transforms of a frame", pairs.file)
     lit, dark = pair_levels(pairs, pairs.lit, progress), pair_levels(pairs, pairs.dark, progress)
-    long_dark, long_lit = (long_series(pairs, which, progress) for which in (False, True))
-    _check_dark(pairs, dark, long_dark)
     signal, light = lit.mean - dark.mean, light_of(pairs, lit)
     saturation = _saturation(lit)
+    pairs = pairs.with_long_at(_LONG_AT * float(light[min(saturation, light.size - 1)]))
+    long_dark, long_lit = (long_series(pairs, which, progress) for which in (False, True))
+    _check_dark(pairs, dark, long_dark)
     top = float(signal[min(saturation, signal.size - 1)])
     clear = lit.clear & (np.arange(signal.size) < saturation) & (signal > 0)
     if clear.sum() < _FEWEST_CLEAR:

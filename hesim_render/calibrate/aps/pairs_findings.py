@@ -6,6 +6,7 @@ import numpy as np
 
 from hesim_render.calibrate.aps.pairs import PairCalibration
 from hesim_render.calibrate.finding import ALARM, Finding
+from hesim_render.recording.pair_set import PairSet
 
 #: Relative changes of signal and variance from which a finding names them.
 _LEAST_BEND, _LEAST_SCATTER = 2e-3, 2e-3
@@ -64,4 +65,23 @@ def findings(result: PairCalibration) -> list[Finding]:
         outcome.append(
             ("black level", f"the dark level changes by {result.black.rms:.2g} DN from exposure to exposure")
         )
+    outcome += _of_the_set(result.pairs)
     return [Finding(check, text, None) for check, text in outcome]
+
+
+def _of_the_set(pairs: PairSet) -> list[tuple[str, str]]:
+    """What the captures are made of."""
+    outcome = []
+    if pairs.one_dark:
+        text = (
+            f"dark frames of one exposure, {1e6 * pairs.dark[0].exposure_s:g} µs, stand for those of all: the dark "
+            "current is not known and counts as light"
+        )
+        outcome.append(("dark frames", text))
+    if len(pairs.long) > 1:
+        text = (
+            f"of {len(pairs.long)} long series in the light, that of {pairs.spatial_lit.label}, nearest to half of "
+            "saturation, gives DSNU, PRNU and the maps; the others are not used"
+        )
+        outcome.append(("long series", text))
+    return outcome
