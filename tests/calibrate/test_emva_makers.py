@@ -14,6 +14,7 @@ from hesim_render.calibrate.aps.pairs import evaluate
 from hesim_render.calibrate.aps.pairs_output import content
 from hesim_render.core.errors import SpecError
 from hesim_render.recording.pair_set import is_pair_set, read_pair_set
+from hesim_render.report.emva import frame_figures
 
 CAMERA = emva_camera.Camera(rows=42, cols=58, long_frames=10)
 NARROW_CAMERA = CAMERA.but(
@@ -120,26 +121,37 @@ def test_the_reference_implementation_is_of_one_opinion(expected, width):
     close_to_reference(found, folder / "EMVA1288_Data.txt")
 
 
-#: A set of the reference implementation's own camera and writer.
+#: A set of the reference implementation's own camera and list; Pillow no longer writes its pictures above 8 bit.
 GENERATED = """if True:
-    import sys, os, random, numpy as np
+    import sys, random, numpy as np
     np.asfarray = lambda a: np.asarray(a, float)
     np.random.seed(5); random.seed(5)
     from emva1288.camera.dataset_generator import DatasetGenerator
-    made = DatasetGenerator(width=90, height=64, bit_depth=int(sys.argv[2]), dark_current_ref=40, steps=30, L=20,
-                            outdir=sys.argv[1])
-    print(made.cam.K, made.cam.bit_depth)
+    from PIL import Image
+
+    class Generator(DatasetGenerator):
+        def save_image(self, img, name):
+            kind = np.uint8 if self.cam.bit_depth <= 8 else np.uint16
+            Image.fromarray(img.astype(kind)).save(self.outdir + "/images/" + name)
+
+    rng = np.random.default_rng(6)
+    made = Generator(width=90, height=64, bit_depth=int(sys.argv[2]), dark_current_ref=40, steps=30, L=20,
+                     u_esat=float(sys.argv[4]), dsnu=float(sys.argv[3]) * rng.standard_normal((64, 90)),
+                     prnu=1 + 0.017 * rng.standard_normal((64, 90)), seed=7, outdir=sys.argv[1])
+    print(made.cam.K)
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bits", (8, 12))
-def test_a_set_of_the_reference_implementations_own_generator(tmp_path, bits):
+@pytest.mark.parametrize("bits,dsnu_e", [(8, 6.1), (12, 4.3)])
+def test_a_set_of_the_reference_implementations_own_generator(tmp_path, bits, dsnu_e):
     pytest.importorskip("emva1288")
-    run = [sys.executable, "-c", GENERATED, str(tmp_path / "made"), str(bits)]
+    run = [sys.executable, "-c", GENERATED, str(tmp_path / "made"), str(bits), str(dsnu_e), "47000"]
     gain = float(subprocess.run(run, capture_output=True, text=True, check=True).stdout.split()[0])
     found = figures(tmp_path / "made")
-    assert holds(found["K"], gain)
+    assert holds(found["K"], gain) and holds(found["prnu_percent"], 1.7)
+    # rounding of the mean of means that scatter by less than a step
+    assert found["dsnu_e"]["value"] == pytest.approx(dsnu_e, rel=0.03)
     close_to_reference(found, tmp_path / "made" / "EMVA1288descriptor.txt")
 
 
@@ -190,6 +202,51 @@ def test_of_several_long_series_that_at_half_of_saturation_is_used(tmp_path):
     assert {half.spatial_lit.exposure_s for half in halves} == {result.pairs.spatial_lit.exposure_s}
 
 
+def test_rounding_that_hides_the_dark_noise_leaves_a_limit(tmp_path):
+    """EMVA 1288 R4.0: below a measured variance of 0.24 DN² σ_d is below 0.49 DN; K and the efficiency are found."""
+    camera = NARROW_CAMERA.but(gain=0.041, read_noise=6.3, row_noise=0.02, dark_current=900.0)
+    folder = Maker().write(tmp_path / "set", series_of(camera, 26), 8, (42, 58))
+    result = evaluate(read_pair_set(folder))
+    assert 1 / 12 < result.dark.variance.min() < 0.24
+    found = content(result)
+    assert holds(found["K"], camera.gain) and holds(found["quantum_efficiency"], camera.efficiency)
+    for name in ("read_noise_e", "temporal_dark_noise_e"):
+        assert found[name]["value"] is None and found[name]["upper_limit"] == pytest.approx(0.49 / 0.041, rel=0.05)
+        assert found[name]["upper_limit"] > camera.read_noise
+    assert any("rounding hides the dark noise" in f["text"] for f in found["findings"])
+    entries = frame_figures(folder).entries
+    for name in ("threshold_e", "threshold_photons", "dynamic_range"):
+        assert "the dark noise is not known: rounding hides it" in entries[name]["reason"]
+
+
+def test_a_full_well_below_the_adcs_range_is_no_gap_of_grey_values(tmp_path):
+    """All but a few pixels are at the well, and none above: from there on the set is saturated, and no more."""
+    camera = CAMERA.but(row_noise=0.1, long_us=5021.0)
+    well = 1907
+    listed = [
+        (lit, us, photons, np.where(frames > well, well + (frames & 1), frames).astype(np.uint16))
+        for lit, us, photons, frames in series_of(camera, 28)
+    ]
+    found = figures(Maker().write(tmp_path / "set", listed, 12, (42, 58)))
+    assert found["full_well_e"]["limited_by"] == "full well" and holds(found["K"], camera.gain)
+    # the standard takes the level of the largest variance, which is the last one that the well leaves whole
+    step = camera.efficiency * camera.photons_per_us * np.diff(camera.exposures_us).max()
+    assert -2 * step < found["full_well_e"]["value"] - (well - camera.black) / camera.gain < 0
+
+
+def test_a_long_series_at_the_full_well_is_refused(taken, tmp_path):
+    """Half of the pixels at the well, the others one above: no spread over pixels follows."""
+    listed = [
+        (lit, us, photons, np.where(frames > 1500, 1501 + (number % 3 == 0), frames).astype(np.uint16))
+        for number, (lit, us, photons, frames) in enumerate(taken["wide"])
+    ]
+    folder = Maker().write(tmp_path / "set", listed, 12, (42, 58))
+    with pytest.raises(
+        SpecError, match=r"Data.txt:\d+: 12882 photons, 11400 µs: the long series is saturated, at 150. DN"
+    ):
+        evaluate(read_pair_set(folder))
+
+
 def mosaic(series, rng):
     """Frames of a mosaic of 2x2 whose place (1, 0) holds a series; the others have other lights."""
     outcome = []
@@ -213,6 +270,32 @@ def test_a_mosaic_is_refused_or_evaluated_at_one_place(taken, expected, tmp_path
     (folder / "capture.yaml").write_text(text + "tile_position: [2, 0]\n", encoding="utf-8")
     with pytest.raises(SpecError, match=r"tile_position \[2, 0\] lies outside of the tile"):
         read_pair_set(folder)
+
+
+def test_a_mosaic_that_is_not_stated_is_recognised(tmp_path):
+    """Three colours, of 100, 71 and 52 % of the light; and rows of two gains, 5 % apart, are no colours."""
+    share = {(0, 0): 0.71, (0, 1): 1.0, (1, 0): 1.0, (1, 1): 0.52}
+    for number, apart in enumerate((True, False)):
+        camera = CAMERA.but(rows=21, cols=29)
+        whole = {}
+        for place, part in share.items():
+            own = camera.but(efficiency=camera.efficiency * (part if apart else 1 - 0.05 * place[0]))
+            whole[place] = series_of(own, 40 + 2 * place[0] + place[1])
+        listed = []
+        for k, (lit, us, photons, frames) in enumerate(whole[0, 0]):
+            mixed = np.empty((len(frames), 42, 58), np.uint16)
+            for (row, col), series in whole.items():
+                mixed[:, row::2, col::2] = series[k][3]
+            listed.append((lit, us, photons, mixed))
+        folder = Maker().write(tmp_path / str(number), listed, 12, (42, 58))
+        if not apart:
+            evaluate(read_pair_set(folder))
+            continue
+        with pytest.raises(SpecError, match=r"the places of a 2x2 tile have 7\d, (100|99), (100|99), 5\d % of the lar"):
+            evaluate(read_pair_set(folder))
+        (folder / "capture.yaml").write_text("bit_depth: 12\ntile_rows: 2\ntile_cols: 2\ntile_position: [1, 1]\n")
+        found = figures(folder)
+        assert holds(found["quantum_efficiency"], 0.52 * camera.efficiency) and holds(found["K"], camera.gain)
 
 
 def edited(expected, tmp_path, change):

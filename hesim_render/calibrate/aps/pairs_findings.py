@@ -6,7 +6,6 @@ import numpy as np
 
 from hesim_render.calibrate.aps.pairs import PairCalibration
 from hesim_render.calibrate.finding import ALARM, Finding
-from hesim_render.recording.pair_set import PairSet
 
 #: Relative changes of signal and variance from which a finding names them.
 _LEAST_BEND, _LEAST_SCATTER = 2e-3, 2e-3
@@ -65,13 +64,20 @@ def findings(result: PairCalibration) -> list[Finding]:
         outcome.append(
             ("black level", f"the dark level changes by {result.black.rms:.2g} DN from exposure to exposure")
         )
-    outcome += _of_the_set(result.pairs)
+    outcome += _of_the_set(result)
     return [Finding(check, text, None) for check, text in outcome]
 
 
-def _of_the_set(pairs: PairSet) -> list[tuple[str, str]]:
+def _of_the_set(result: PairCalibration) -> list[tuple[str, str]]:
     """What the captures are made of."""
+    pairs = result.pairs
     outcome = []
+    if result.dark_noise_is_hidden:
+        text = (
+            f"the dark variance is down to {result.dark.variance.min():.3f} DN², below the 0.24 of EMVA 1288: rounding "
+            "hides the dark noise, which has an upper limit alone. Capture with more bits or a higher gain"
+        )
+        outcome.append(("dark noise", text))
     if pairs.one_dark:
         text = (
             f"dark frames of one exposure, {1e6 * pairs.dark[0].exposure_s:g} µs, stand for those of all: the dark "
