@@ -55,11 +55,11 @@ def find_list(folder: Path) -> Path | None:
         return None
     entries = sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in _SUFFIXES and entry.is_file())
     named = [entry for entry in entries if entry.name.casefold() == DATA_FILE.casefold()]
-    found = named or [entry for entry in entries if _is_list(entry)]
-    if len(found) > 1:
-        names = " and ".join(printable(entry.name) for entry in found[:3])
-        raise SpecError(f"holds {len(found)} lists of EMVA 1288 pictures, {names}; name the one to use", file=folder)
-    return found[0] if found else None
+    result = named or [entry for entry in entries if _is_list(entry)]
+    if len(result) > 1:
+        names = " and ".join(printable(entry.name) for entry in result[:3])
+        raise SpecError(f"holds {len(result)} lists of EMVA 1288 pictures, {names}; name the one to use", file=folder)
+    return result[0] if result else None
 
 
 def _is_list(file: Path) -> bool:
@@ -105,7 +105,7 @@ def read_list(file: Path, unit: str | None = None) -> tuple[int, tuple[int, int]
     series: list[Series] = []
     pictures = _Pictures(file)
     scale = _UNITS_S[unit or "ns"]
-    one_each = False
+    is_repeated = False
     for line, whole in enumerate(text.splitlines(), 1):
         stripped = whole.strip()
         if not stripped.strip(_SEPARATORS) or stripped.startswith(_COMMENTS):
@@ -123,8 +123,8 @@ def read_list(file: Path, unit: str | None = None) -> tuple[int, tuple[int, int]
         elif kind in ("b", "d"):
             entry = _exposure(file, line, kind, _uncommented(rest), scale)
             # some programs repeat the line of the exposure before each picture
-            again = bool(series) and _key(series[-1]) == _key(entry) and (one_each or len(series[-1].files) == 1)
-            one_each = again
+            again = bool(series) and _key(series[-1]) == _key(entry) and (is_repeated or len(series[-1].files) == 1)
+            is_repeated = again
             if not again:
                 series.append(entry)
         elif kind == "i":
@@ -237,14 +237,14 @@ class _Pictures:
         with reading(self._file):
             if not parts or ".." in parts or (not absolute and leads_out(self._folder, plain)):
                 raise SpecError(f"{shown!r} leads out of its folder", file=self._file, line=line)
-            found = next(
+            result = next(
                 (path for first in range(len(parts)) if (path := self._exact(parts[first:])) is not None), None
             )
-            if found is None:
+            if result is None:
                 raise SpecError(f"no such file: {shown!r}", file=self._file, line=line)
-            if leads_out(self._folder, found.relative_to(self._folder)):
+            if leads_out(self._folder, result.relative_to(self._folder)):
                 raise SpecError(f"{shown!r} leads out of its folder", file=self._file, line=line)
-        return found
+        return result
 
     def _exact(self, parts: list[str]) -> Path | None:
         """The one file of these names in letters of any case; the same case goes first."""
@@ -258,8 +258,8 @@ class _Pictures:
                 for entry in here.iterdir() if here.is_dir() else ():
                     names.setdefault(entry.name.casefold(), []).append(entry)
                 self._listed[here] = names
-            found = self._listed[here].get(part.casefold(), [])
-            if len(found) != 1:
+            result = self._listed[here].get(part.casefold(), [])
+            if len(result) != 1:
                 return None
-            here = found[0]
+            here = result[0]
         return here if here.is_file() else None

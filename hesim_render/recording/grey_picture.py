@@ -129,13 +129,13 @@ def _pgm_header(file: Path) -> tuple[str, tuple[int, int], int, int]:
     if begin[:2] in (b"P3", b"P6"):
         raise SpecError(f"is {_COLOUR}", file=file)
     comment = rb"(?:\s|#[^\r\n]*[\r\n])+"
-    found = re.match(rb"(P[25])" + comment + rb"(\d{1,6})" + comment + rb"(\d{1,6})" + comment + rb"(\d{1,6})\s", begin)
-    if found is None:
+    match = re.match(rb"(P[25])" + comment + rb"(\d{1,6})" + comment + rb"(\d{1,6})" + comment + rb"(\d{1,6})\s", begin)
+    if match is None:
         raise SpecError("is no PGM file (P2 or P5)", file=file)
-    kind, width, height, largest = found.groups()
+    kind, width, height, largest = match.groups()
     if not 1 <= int(largest) < 1 << 16:
         raise SpecError(f"states the largest value {int(largest)}; expected 1 to 65535", file=file)
-    return kind.decode("ascii"), (int(height), int(width)), int(largest), found.end()
+    return kind.decode("ascii"), (int(height), int(width)), int(largest), match.end()
 
 
 def _read_pgm(file: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:

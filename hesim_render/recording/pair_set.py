@@ -70,7 +70,7 @@ class PairSet:
         return all(series.photons is not None for series in self.lit)
 
     @property
-    def one_dark(self) -> bool:
+    def is_dark_once(self) -> bool:
         """Whether dark frames of one exposure stand for those of all, so that dark current counts as light."""
         return any(not _same(lit.exposure_s, dark.exposure_s) for lit, dark in zip(self.lit, self.dark, strict=True))
 
@@ -269,25 +269,25 @@ def _dark_of(lit: list[Series], dark: list[Series], all_dark: list[Series]) -> l
 
 def _long_series(file: Path, series: list[Series]) -> list[tuple[Series, Series]]:
     """The series of more than two frames, lit and dark, that belong together."""
-    found = {lit: [s for s in series if s.lit == lit and len(s.files) > 2] for lit in (True, False)}
+    by_light = {lit: [s for s in series if s.lit == lit and len(s.files) > 2] for lit in (True, False)}
     for lit, name in ((True, "lit"), (False, "dark")):
-        if not found[lit]:
+        if not by_light[lit]:
             raise SpecError(f"0 {name} series of more than two frames; one is needed, for DSNU and PRNU", file=file)
-    one_dark = len({s.exposure_s for s in series if not s.lit}) == 1
+    is_dark_once = len({s.exposure_s for s in series if not s.lit}) == 1
     result = []
-    for lit_one in found[True]:
-        nearest = min(found[False], key=lambda dark: abs(dark.exposure_s - lit_one.exposure_s))
-        if one_dark or _same(nearest.exposure_s, lit_one.exposure_s):
-            result.append((lit_one, nearest))
+    for entry in by_light[True]:
+        nearest = min(by_light[False], key=lambda dark: abs(dark.exposure_s - entry.exposure_s))
+        if is_dark_once or _same(nearest.exposure_s, entry.exposure_s):
+            result.append((entry, nearest))
     if not result:
-        raise found[True][0].error(
-            f"the dark series is of {found[False][0].exposure_s * 1e6:g} µs; both need one exposure"
+        raise by_light[True][0].error(
+            f"the dark series is of {by_light[False][0].exposure_s * 1e6:g} µs; both need one exposure"
         )
     return result
 
 
-def _same(one_s: float, other_s: float) -> bool:
-    return abs(one_s - other_s) <= _SAME_EXPOSURE * max(one_s, other_s)
+def _same(first_s: float, second_s: float) -> bool:
+    return abs(first_s - second_s) <= _SAME_EXPOSURE * max(first_s, second_s)
 
 
 def _light(series: Series, has_photons: bool) -> float:

@@ -42,7 +42,7 @@ _FIT_TOP = 0.7
 #: Part of saturation at which it takes the long series.
 _LONG_AT = 0.5
 #: Dark variance as measured, DN², below which EMVA 1288 gives the dark noise no value but a limit, and that limit, DN.
-_HIDDEN_DN2, HIDDEN_LIMIT_DN = 0.24, 0.49
+_LEAST_DARK_DN2, DARK_NOISE_LIMIT_DN = 0.24, 0.49
 #: Scatter of the light from exposure to exposure that is refused.
 _MOST_SCATTER = MOST_CHANGE
 #: Relative differences of the places of a tile from which they are colours.
@@ -117,9 +117,9 @@ class PairCalibration:
         return self.long_dark.spectrum
 
     @property
-    def dark_noise_is_hidden(self) -> bool:
+    def dark_noise_is_rounded_off(self) -> bool:
         """Whether rounding hides the dark noise (EMVA 1288 R4.0: a measured variance below 0.24 DN²)."""
-        return bool(np.min(self.dark.variance + np.maximum(self.dark.row, 0.0)) < _HIDDEN_DN2)
+        return bool(np.min(self.dark.variance + np.maximum(self.dark.row, 0.0)) < _LEAST_DARK_DN2)
 
     @property
     def light(self) -> NDArray[np.float64]:

@@ -72,13 +72,13 @@ def _of_the_set(result: PairCalibration) -> list[tuple[str, str]]:
     """What the captures are made of."""
     pairs = result.pairs
     outcome = []
-    if result.dark_noise_is_hidden:
+    if result.dark_noise_is_rounded_off:
         text = (
             f"the dark variance is down to {result.dark.variance.min():.3f} DN², below the 0.24 of EMVA 1288: rounding "
             "hides the dark noise, which has an upper limit alone. Capture with more bits or a higher gain"
         )
         outcome.append(("dark noise", text))
-    if pairs.one_dark:
+    if pairs.is_dark_once:
         text = (
             f"dark frames of one exposure, {1e6 * pairs.dark[0].exposure_s:g} µs, stand for those of all: the dark "
             "current is not known and counts as light"
