@@ -202,6 +202,7 @@ def _linearity(axes: Axes, figures: FrameFigures) -> None:
     end = min(float(light.max()), float(signal.max()) / slope)
     axes.plot([0, end], [0, slope * end], color=COLOURS[1], label="responsivity")
     axes.set_ylim(top=_LEGEND_ROOM * float(signal.max()))
+    axes.xaxis.set_major_formatter(tick_text)  # no power of ten apart from the numbers
     axes.legend(frameon=False, loc="upper left")
 
 
