@@ -168,6 +168,20 @@ def test_the_light_may_vary_at_one_exposure(tmp_path):
     assert "dark frames" not in {f["check"] for f in found["findings"]}
 
 
+@pytest.mark.parametrize("factor,is_one", [(1.0006, True), (0.9994, True), (1.004, False), (0.996, False)])
+def test_exposures_of_light_and_dark_agree_within_a_thousandth(taken, tmp_path, factor, is_one):
+    """As clocks of cameras round them; the next dark pair is far away."""
+    listed = [(lit, us if lit else factor * us, photons, frames) for lit, us, photons, frames in taken["wide"]]
+    folder = Maker().write(tmp_path / "set", listed, 12, (42, 58))
+    if is_one:
+        pairs = read_pair_set(folder)
+        assert [d.exposure_s for d in pairs.dark] == pytest.approx([factor * s.exposure_s for s in pairs.lit], rel=1e-6)
+        assert not pairs.is_dark_once
+    else:
+        with pytest.raises(SpecError, match=r"Data.txt:4: 452 photons, 400 µs: no dark pair of this exposure"):
+            read_pair_set(folder)
+
+
 @pytest.mark.parametrize("pair", (True, False))
 def test_dark_frames_of_one_exposure_stand_for_all(taken, tmp_path, pair):
     """A pair of one exposure and the long series, or the long series alone; the dark current is too small to matter."""
