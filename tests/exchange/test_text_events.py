@@ -113,6 +113,14 @@ def test_times_are_rounded_to_the_nearest_microsecond(tmp_path):
     )
 
 
+def test_of_two_orders_that_have_polarities_that_whose_times_rise_is_taken(tmp_path):
+    """``x y p t`` of times 0 and 1, which could be polarities."""
+    path = tmp_path / "a.txt"
+    path.write_text("5 3 1 0\n2 4 0 0\n9 8 1 1\n7 6 0 1\n", encoding="ascii")
+    expected = [0, 0, 1, 1], [5, 2, 9, 7], [3, 4, 8, 6], [1, 0, 1, 0]
+    same(open_events(path, shape=(ROWS, COLS)), [np.array(column) for column in expected])
+
+
 GOOD = "9 3 4 1\n12 5 6 0\n"
 BAD = {
     "a value too few": (GOOD + "13 4 4\n14 1 1 1\n", r"a.txt:3: 3 values; expected 4"),
