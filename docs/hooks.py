@@ -21,6 +21,8 @@ CITED = re.compile(r"(?<!\])\[([a-z]+\d{4}[a-z]?(?:, [a-z]+\d{4}[a-z]?)*)\](?![(
 INDEXED = re.compile(r"(?<![\w/.:])([A-Za-zΔΘΛΣΦΨΩαβγδηθκλμνρσςτφχψωϱ])_([A-Za-z0-9]+)(?![A-Za-z0-9_/])")
 #: Characters of a cell from which a table does not fit on a telephone.
 LONG_CELL = 40
+#: Letters of a word that is a key: the column beside it would be too narrow on a telephone.
+LONG_WORD = 18
 #: Where docs/cli.md is to have what `--help-all` says of each command.
 COMMANDS = "<!-- commands -->"
 
@@ -101,7 +103,9 @@ def on_page_content(html: str, **_: Any) -> str:
     def named(table: re.Match) -> str:
         heads = [plain_text(head) for head in re.findall(r"<th[^>]*>(.*?)</th>", table.group(0), re.DOTALL)]
         cells = re.findall(r"<td[^>]*>(.*?)</td>", table.group(0), re.DOTALL)
-        has_keys = len(heads) == 2 and any("<code>" in cell for cell in cells[::2])
+        has_keys = len(heads) == 2 and any(
+            "<code>" in cell or max(map(len, plain_text(cell).split()), default=0) > LONG_WORD for cell in cells[::2]
+        )
         if not (len(heads) > 2 or has_keys) or not any(len(plain_text(cell)) > LONG_CELL for cell in cells):
             return table.group(0)
         count = iter(range(len(cells)))

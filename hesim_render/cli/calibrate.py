@@ -86,7 +86,7 @@ def lab(
 
 @app.command()
 def aps(
-    captures: Annotated[Path, typer.Argument(help="folder of a capture set, or of EMVA 1288 captures")],
+    captures: Annotated[Path, typer.Argument(help="folder of a capture set, or of EMVA 1288 captures, or their list")],
     out: _Out,
     report: _Report = None,
     sensor_file: Annotated[

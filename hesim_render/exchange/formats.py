@@ -29,6 +29,8 @@ from hesim_render.exchange import (
     nmnist,
     prophesee_hdf5,
     raw_file,
+    text_events,
+    text_form,
 )
 from hesim_render.exchange.stream import EventStream
 
@@ -110,7 +112,7 @@ FRAME_FORMATS = {
 }
 #: Formats that can be read, by the first bytes of their files.
 _BEGINS = {b"% ": "raw", b"#!AER-DAT": "aedat4", b"\x89HDF\r\n\x1a\n": "dsec", b"PK": "npz", mcap_file.BEGIN: "mcap"}
-READABLE = (*_RAW, "dat", "prophesee", "aedat4", "dsec", "npz", "mcap")
+READABLE = (*_RAW, "dat", "prophesee", "aedat4", "dsec", "npz", "mcap", "txt")
 
 
 def open_events(
@@ -121,9 +123,9 @@ def open_events(
     Parameters
     ----------
     path : the file: EVT2 or EVT3 RAW, DAT, AEDAT4, HDF5 in the layout of DSEC or of Prophesee, ``.npz`` with t, x, y
-        and p, or MCAP with messages of type EventArray or EventPacket.
-    format : ``evt2``, ``evt3``, ``dat``, ``prophesee``, ``aedat4``, ``dsec``, ``npz`` or ``mcap``; default: what the
-        begin of the file says.
+        and p, MCAP with messages of type EventArray or EventPacket, or text with a line t x y p for each event.
+    format : ``evt2``, ``evt3``, ``dat``, ``prophesee``, ``aedat4``, ``dsec``, ``npz``, ``mcap`` or ``txt``; default:
+        what the begin of the file says.
     shape : rows and columns of the event grid, px; needed if the file does not state them.
     keep_stated : let the shape that the file states, if it does, come before `shape`.
 
@@ -168,14 +170,21 @@ def is_event_file(path: str | Path) -> bool:
         begin = opened.read(16)
     name = next((name for start, name in _BEGINS.items() if begin.startswith(start)), None)
     if name != "npz":
-        return name is not None
+        return name is not None or _is_text(file)
     with reading(file, "as arrays"), np.load(file) as arrays:
         return not {"raw", "aps_raw"} & set(arrays.files)
+
+
+def _is_text(file: Path) -> bool:
+    """Whether a file is a list of events as text, by its suffix and its begin."""
+    return file.suffix.lower() in text_form.TEXT_SUFFIXES and text_form.is_text(file)
 
 
 def _detect(file: Path) -> str | None:
     with reading(file), file.open("rb") as opened:
         begin = opened.read(16)
+    if _is_text(file):
+        return "txt"
     result = next((name for start, name in _BEGINS.items() if begin.startswith(start)), None)
     if result == "raw" and dat.is_dat(file):
         return "dat"
@@ -230,6 +239,11 @@ def _open_mcap(file: Path) -> EventStream:
     return EventStream(lambda: mcap_file.read(file, topic), shape, file)
 
 
+def _open_text(file: Path) -> EventStream:
+    form = text_form.read_form(file)
+    return EventStream(lambda: text_events.read(file, form), form.shape or (0, 0), file)
+
+
 _OPENERS: dict[str, Callable[[Path], EventStream]] = {
     **dict.fromkeys(_RAW, _open_raw),
     "dat": _open_dat,
@@ -238,4 +252,5 @@ _OPENERS: dict[str, Callable[[Path], EventStream]] = {
     "dsec": _open_dsec,
     "npz": _open_npz,
     "mcap": _open_mcap,
+    "txt": _open_text,
 }

@@ -140,7 +140,7 @@ def read_dng(path: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
     """
     import tifffile
 
-    with reading(path, "as a DNG file"), _quiet("tifffile"), tifffile.TiffFile(path) as file:
+    with reading(path, "as a DNG file"), quiet("tifffile"), tifffile.TiffFile(path) as file:
         page = file.pages[0].aspage()
         if page.shape != shape or page.dtype != np.uint16 or page.compression != 1:
             raise SpecError(
@@ -162,13 +162,13 @@ def is_packed(path: Path) -> bool:
     """
     import tifffile
 
-    with reading(path, "as a DNG file"), _quiet("tifffile"), tifffile.TiffFile(path) as file:
+    with reading(path, "as a DNG file"), quiet("tifffile"), tifffile.TiffFile(path) as file:
         page = file.pages[0].aspage()
         return page.compression != 1 or page.is_tiled or page.subfiletype & 1 == 1
 
 
 @contextlib.contextmanager
-def _quiet(name: str) -> Iterator[None]:
+def quiet(name: str) -> Iterator[None]:
     """Switch off the log of a library; our own error reports a damaged file."""
     log = logging.getLogger(name)
     before = log.disabled

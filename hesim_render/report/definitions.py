@@ -126,9 +126,9 @@ FRAMES: dict[str, Definition] = {
                                      "R/K", "pairs"),
     "temporal_dark_noise_e": Definition("temporal dark noise σ_d", "Noise of a dark pixel from frame to frame at no "
                                         "exposure, without that of rounding.", "√(σ_y.dark² − 1/12)/K", "dark pairs"),
-    "threshold_e": Definition("absolute sensitivity threshold", "Signal that equals its noise.",
+    "threshold_e": Definition("absolute sensitivity threshold, electrons", "Signal that equals its noise.",
                               "√(σ_d² + 1/(12 K²)) + 1/2", "from σ_d"),
-    "threshold_photons": Definition("absolute sensitivity threshold", "The same in photons.",
+    "threshold_photons": Definition("absolute sensitivity threshold, photons", "The same in photons.",
                                     "(√(σ_d² + 1/(12 K²)) + 1/2)/η", "from σ_d and η"),
     "full_well_e": Definition("saturation capacity", "Electrons at the largest temporal variance.",
                               "η·μ_p.sat", "pairs"),

@@ -23,6 +23,8 @@ Draw = Callable[["Axes"], None]
 _ON_OFF = (COLOURS[1], COLOURS[0])
 #: Axes of a smaller range have numbers between powers of ten.
 _FEW_DECADES = 100.0
+#: Height of axes over that of their data, where a legend stands above these.
+_LEGEND_ROOM = 1.35
 #: Intervals are drawn up to here, µs.
 _LONGEST_INTERVAL_US = 5000
 
@@ -188,7 +190,8 @@ def _transfer(axes: Axes, figures: FrameFigures) -> None:
     points(axes, signal, variance, COLOURS[0], "pairs", 4.2)
     top = 0.7 * figures.result.top_dn
     axes.plot([0, top], [0, figures.result.gain.slope * top], color=COLOURS[1], label="K, 0 to 70 % of saturation")
-    axes.legend(frameon=False)
+    axes.set_ylim(top=_LEGEND_ROOM * float(variance.max()))
+    axes.legend(frameon=False, loc="upper left")
 
 
 def _linearity(axes: Axes, figures: FrameFigures) -> None:
@@ -198,7 +201,9 @@ def _linearity(axes: Axes, figures: FrameFigures) -> None:
     slope = figures.result.responsivity.slope
     end = min(float(light.max()), float(signal.max()) / slope)
     axes.plot([0, end], [0, slope * end], color=COLOURS[1], label="responsivity")
-    axes.legend(frameon=False)
+    axes.set_ylim(top=_LEGEND_ROOM * float(signal.max()))
+    axes.xaxis.set_major_formatter(tick_text)  # no power of ten apart from the numbers
+    axes.legend(frameon=False, loc="upper left")
 
 
 def _snr(axes: Axes, figures: FrameFigures) -> None:

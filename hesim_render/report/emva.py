@@ -70,6 +70,9 @@ def _of_both(entries: dict[str, dict[str, Any]], result: PairCalibration) -> dic
     else:
         ratio = well["standard_error"] / well["value"]
         outcome["snr_max"] = estimated(10 * np.log10(well["value"]), 10 / np.log(10) * ratio, "dB")
+    if noise["value"] is None:
+        unknown = not_identifiable(f"the dark noise is not known: {noise['reason']}")
+        return outcome | dict.fromkeys(("threshold_e", "threshold_photons", "dynamic_range"), unknown)
     # σ_d of the standard has the ADC in it: σ_d² of ours and σ_q²/K²
     dark = float(np.hypot(noise["value"], np.sqrt(1 / 12) / k["value"]))
     error = noise["value"] / dark * noise["standard_error"]

@@ -26,6 +26,12 @@ class CaptureSpec(Strict):
     tile_cols: PositiveInt
     notes: str = ""
     sensor: str | None = None
+    tile_position: tuple[int, int] | None = Field(
+        None, description="row and column, from 0, of the colour of the tile that EMVA 1288 captures are evaluated for"
+    )
+    exposure_unit: Literal["ns", "us", "ms", "s"] | None = Field(
+        None, description="of exposures in a list of EMVA 1288 pictures; default ns, the standard's"
+    )
     roi: Region | None = Field(None, description="the whole sensor where it is left out")
     theta_hardware_v: PositiveFloat | None = None
     signal_reference: SignalReference | None = None
@@ -49,6 +55,10 @@ class CaptureSpec(Strict):
     def _check(self) -> CaptureSpec:
         if (self.evs_tile_rows is None) != (self.evs_tile_cols is None):
             raise ValueError("evs_tile_rows and evs_tile_cols are given together or not at all")
+        if self.tile_position is not None:
+            for value, count in zip(self.tile_position, (self.tile_rows, self.tile_cols), strict=True):
+                if not 0 <= value < count:
+                    raise ValueError(f"tile_position {list(self.tile_position)} lies outside of the tile")
         return self
 
     @property

@@ -78,6 +78,7 @@ def make_twin(
     with OutputFolder(out, RESULT_NAME, overwrite) as folder, output_errors(folder.target):
         calibration = folder.path / "calibration.yaml"
         result = calibrate_pairs(fitted, calibration, progress=progress)
+        held = held.with_long_of(result.pairs)
         sensor_file = write_sensor(folder.path / "sensor.yaml", calibration, result)
         bench = TwinBench(load_sensor(sensor_file), result, read_maps(calibration, "aps")["light_rel"], seed)
         real = Half(

@@ -97,6 +97,17 @@ def test_light_drifts_beyond_six_deviations_of_rows_and_pixels(factor):
         pair_levels._check(entry, found, *frames, 4095)
 
 
+def test_values_above_a_full_well_are_no_gaps():
+    """Most pixels at the well, the others spread over 40 DN below it; without every third of those values there are."""
+    rng = np.random.default_rng(5)
+    first, second = (1501 - (rng.random((64, 90)) < 0.1) * rng.integers(1, 41, (64, 90)) for _ in range(2))
+    absent, expected = pair_levels._gaps(first, second, 4095)
+    assert absent == 0 and 10 < expected < 20
+    first, second = (np.where(frame % 3, frame, frame + 1) for frame in (first, second))
+    absent, expected = pair_levels._gaps(first, second, 4095)
+    assert absent == pytest.approx(expected / 3, abs=1)
+
+
 def test_the_gradient_of_the_curve_is_that_of_finite_differences():
     p, h, step = np.array([0.04, 5.0, -1.3, 0.7]), np.linspace(0.1, 1.1, 7), 1e-6
     expected = [(light_curve._value(p + d, h) - light_curve._value(p - d, h)) / (2 * step) for d in step * np.eye(4)]
@@ -332,7 +343,7 @@ def test_a_wrong_list_is_one_error_with_file_and_line(written, tmp_path, name):
 
 def test_captures_that_do_not_fit_into_memory_are_refused_before_a_frame_is_read(written, monkeypatch):
     monkeypatch.setattr("hesim_render.core.guard._machine_bytes", lambda: 36 * 52 * 100)
-    monkeypatch.setattr("hesim_render.recording.pair_set.read_raw", None)
+    monkeypatch.setattr("hesim_render.recording.pair_set.read_grey", None)
     with pytest.raises(SpecError, match=r"EMVA1288_Data\.txt: maps and transforms of a frame would take"):
         evaluate(read_pair_set(written))
 

@@ -25,7 +25,7 @@ from hesim_render.exchange import aedat4, open_events, stream
 from hesim_render.exchange.aedat4 import FlatTable
 from hesim_render.exchange.dsec import read_events as read_dsec
 
-READABLE = ("evt2", "evt3", "dat", "aedat4", "dsec", "dsec-gzip", "npz")
+READABLE = ("evt2", "evt3", "dat", "aedat4", "dsec", "dsec-gzip", "npz", "txt")
 QUICK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 #: Times at which the counters of EVT3 (2^12, 2^24) and EVT2 (2^6, 2^34) start again, and one of days.
 TURNS = [0, 1 << 6, 1 << 12, 1 << 24, 1 << 25, 1 << 32, 1 << 34, 1 << 40]

@@ -267,7 +267,7 @@ def build_targets(folder):
 
 def event_files_of_others(folder):
     events = event_files.many(300, 40_000, (24, 32))
-    for name in ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "npz"):
+    for name in ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "npz", "txt"):
         (folder / name).mkdir()
         event_files.written(events, name, folder / name, (24, 32))
 

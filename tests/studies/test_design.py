@@ -369,7 +369,8 @@ def test_a_design_is_a_sensor_file_and_a_verdict(tmp_path, capsys, steps):
         assert verdict["cost_difference_high"] < 0 and verdict["delta_e_mean"] < verdict["delta_e_mean_against"]
         assert "mtf50_cy_per_px" in verdict and verdict["zone_plate_colour"] > 0
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "<h2>Verdict</h2>" in page and f"<p>{' '.join(design_verdict(verdict))}</p>" in page
+    assert page.count("<h2>Verdict</h2>") == 1 and "<h2>Verdict for each light</h2>" in page
+    assert f"<p>{' '.join(design_verdict(verdict))}</p>" in page
     sensor = hr.load_sensor(tmp_path / "out" / "sensor.yaml")
     assert sensor.spec.tile == "RG\nGB" and list(sensor.spec.filters) == ["red", "green", "blue"]
     # the figures of the file are those of the judgement

@@ -37,8 +37,8 @@ class Camera:
     def but(self, **changes):
         return replace(self, **changes)
 
-    def set(self, seed):
-        """All frames of one device: {(lit, exposure_us): uint16 [frame, row, col]}, pairs and long series apart."""
+    def bench(self, seed):
+        """A function of (lit, exposure_us, count, photons_per_us) that gives frames of one device."""
         rng = np.random.default_rng(seed)
         shape = self.rows, self.cols
 
@@ -50,10 +50,10 @@ class Camera:
         response = 1 + pattern(self.prnu)
         grid = np.add.outer(np.arange(self.rows), np.arange(self.cols))
 
-        def frame(lit, exposure_us):
+        def frame(lit, exposure_us, photons_per_us):
             light = 0.0
             if lit:
-                light = self.efficiency * self.photons_per_us * (exposure_us + self.late_us) * response
+                light = self.efficiency * photons_per_us * (exposure_us + self.late_us) * response
                 light = light * (1 + self.light_scatter * rng.standard_normal())
             electrons = rng.poisson(light + self.dark_current * exposure_us * 1e-6 + np.zeros(shape))
             signal = self.gain * electrons
@@ -68,9 +68,14 @@ class Camera:
             value = value + np.sqrt(2) * self.hum * np.cos(np.pi * grid + 2 * np.pi * rng.random())
             return np.clip(np.rint(value), 0, 2**self.bits - 1).astype(np.uint16)
 
-        def frames(lit, exposure_us, count):
-            return np.stack([frame(lit, exposure_us) for _ in range(count)])
+        def frames(lit, exposure_us, count, photons_per_us=self.photons_per_us):
+            return np.stack([frame(lit, exposure_us, photons_per_us) for _ in range(count)])
 
+        return frames
+
+    def set(self, seed):
+        """All frames of one device: {(lit, exposure_us): uint16 [frame, row, col]}, pairs and long series apart."""
+        frames = self.bench(seed)
         pairs = {(lit, t): frames(lit, t, 2) for t in self.exposures_us for lit in (True, False)}
         long = {lit: frames(lit, self.long_us, self.long_frames) for lit in (True, False)}
         return pairs, long

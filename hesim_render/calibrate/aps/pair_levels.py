@@ -131,6 +131,8 @@ def _check(entry: Series, statistics: tuple[float, ...], first: NDArray, second:
     low, high = statistics[-2:]
     if max(low, high) > 0.5:
         return
+    if variance == 0 and first.min() == first.max():
+        return  # at the full well
     if np.array_equal(first, second):
         raise entry.error("both frames are the same; a pair has two exposures")
     noise = np.sqrt(2 * variance / first.size + 2 * max(statistics[4], 0.0) / first.shape[0])
@@ -148,12 +150,16 @@ def _check(entry: Series, statistics: tuple[float, ...], first: NDArray, second:
 
 
 def _gaps(first: NDArray, second: NDArray, full: int) -> tuple[int, int]:
-    """Grey values near the mean that no pixel has, and how many were expected."""
+    """Grey values near the mean that no pixel has, and how many were expected.
+
+    Values beyond the last one that occurs do not count: a full well ends the signal there, far from a normal law.
+    """
     counts = np.bincount(first.ravel(), minlength=full + 1) + np.bincount(second.ravel(), minlength=full + 1)
     value = np.arange(counts.size)
     mean = float(counts @ value) / counts.sum()
     spread = max(float(np.sqrt(counts @ (value - mean) ** 2 / counts.sum())), 0.5)
-    low, high = max(0, round(mean - _CENTRAL * spread)), min(full, round(mean + _CENTRAL * spread))
+    seen = np.flatnonzero(counts)
+    low, high = max(int(seen[0]), round(mean - _CENTRAL * spread)), min(int(seen[-1]), round(mean + _CENTRAL * spread))
     if counts.sum() * 0.13 / spread < _EXPECTED:
         return 0, 0
     return int(np.sum(counts[low : high + 1] == 0)), high - low + 1

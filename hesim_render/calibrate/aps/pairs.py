@@ -34,13 +34,21 @@ from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_varianc
 from hesim_render.calibrate.moments import Progress
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import require_memory
-from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, QUANTISED_VARIANCE_DN2, polynomial
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, polynomial
 from hesim_render.recording.pair_set import PairSet
 
 #: EMVA 1288 fits from 0 to this part of saturation.
 _FIT_TOP = 0.7
+#: Part of saturation at which it takes the long series.
+_LONG_AT = 0.5
+#: Dark variance as measured, DN², below which EMVA 1288 gives the dark noise no value but a limit, and that limit, DN.
+_LEAST_DARK_DN2, DARK_NOISE_LIMIT_DN = 0.24, 0.49
 #: Scatter of the light from exposure to exposure that is refused.
 _MOST_SCATTER = MOST_CHANGE
+#: Relative differences of the places of a tile from which they are colours.
+_MOSAIC = 0.08
+#: Part of the largest temporal variance below which a brighter series is at the full well.
+_WELL_PART = 0.5
 _FEWEST_CLEAR = 5
 #: Memory of an evaluation, most of it transforms of frames in double precision.
 _BYTES_PER_PIXEL = 200
@@ -109,6 +117,11 @@ class PairCalibration:
         return self.long_dark.spectrum
 
     @property
+    def dark_noise_is_rounded_off(self) -> bool:
+        """Whether rounding hides the dark noise (EMVA 1288 R4.0: a measured variance below 0.24 DN²)."""
+        return bool(np.min(self.dark.variance + np.maximum(self.dark.row, 0.0)) < _LEAST_DARK_DN2)
+
+    @property
     def light(self) -> NDArray[np.float64]:
         """Light of each level: photons per pixel, or the exposure in s where photons are not stated."""
         return light_of(self.pairs, self.lit)
@@ -134,10 +147,13 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     """
     require_memory(_BYTES_PER_PIXEL * pairs.shape[0] * pairs.shape[1], "maps and transforms of a frame", pairs.file)
     lit, dark = pair_levels(pairs, pairs.lit, progress), pair_levels(pairs, pairs.dark, progress)
-    long_dark, long_lit = (long_series(pairs, which, progress) for which in (False, True))
-    _check_dark(pairs, dark, long_dark)
     signal, light = lit.mean - dark.mean, light_of(pairs, lit)
     saturation = _saturation(lit)
+    pairs = pairs.with_long_at(_LONG_AT * float(light[min(saturation, light.size - 1)]))
+    long_dark, long_lit = (long_series(pairs, which, progress) for which in (False, True))
+    _check_dark(pairs, dark, long_dark)
+    _check_long(pairs, long_lit, lit, saturation)
+    _check_mosaic(pairs, long_lit.mean - long_dark.mean)
     top = float(signal[min(saturation, signal.size - 1)])
     clear = lit.clear & (np.arange(signal.size) < saturation) & (signal > 0)
     if clear.sum() < _FEWEST_CLEAR:
@@ -186,14 +202,32 @@ def _check_dark(pairs: PairSet, dark: Levels, long_dark: Long) -> None:
                 f"{100 * dark.low[k]:.3g} % of the dark pixels are 0 DN, which hides a part of the noise; raise the "
                 "black level (offset)"
             )
-        if dark.variance[k] - ADC_VARIANCE_DN2 < QUANTISED_VARIANCE_DN2:
-            raise entry.error(
-                f"the dark variance is {dark.variance[k]:.3f} DN², below "
-                f"{QUANTISED_VARIANCE_DN2 + ADC_VARIANCE_DN2:.2f}: "
-                "rounding hides the noise; capture with more bits or a higher gain"
-            )
     if long_dark.temporal.pixel <= 0:
         raise pairs.spatial_dark.error("the frames do not differ")
+
+
+def _check_long(pairs: PairSet, long_lit: Long, lit: Levels, saturation: int) -> None:
+    """Refuse a long series at the full well, where the light makes no noise any more and no spread over pixels."""
+    if saturation >= lit.mean.size:
+        return
+    if long_lit.mean.mean() >= lit.mean[saturation] and long_lit.temporal.pixel < _WELL_PART * lit.variance[saturation]:
+        raise pairs.spatial_lit.error(
+            f"the long series is saturated, at {long_lit.mean.mean():.0f} DN; EMVA 1288 takes it at 50 % of saturation"
+        )
+
+
+def _check_mosaic(pairs: PairSet, signal: NDArray) -> None:
+    """Refuse frames whose places of a 2x2 tile have signals of their own, far apart beside the pixels' spread."""
+    rows, cols = (count - count % 2 for count in signal.shape)
+    places = signal[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2).transpose(1, 3, 0, 2).reshape(4, -1)
+    middle = np.median(places, axis=1)
+    spread = np.median(np.abs(places - middle[:, None])) / 0.6745
+    if np.ptp(middle) > max(_MOSAIC * middle.mean(), 3 * spread):
+        shares = ", ".join(f"{100 * value / middle.max():.0f}" for value in middle)
+        raise pairs.spatial_lit.error(
+            f"the places of a 2x2 tile have {shares} % of the largest signal: a colour mosaic. EMVA 1288 evaluates one "
+            "colour at a time; state tile_rows: 2, tile_cols: 2 and tile_position: [row, column] in capture.yaml"
+        )
 
 
 def _saturation(lit: Levels) -> int:

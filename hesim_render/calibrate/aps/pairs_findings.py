@@ -64,4 +64,30 @@ def findings(result: PairCalibration) -> list[Finding]:
         outcome.append(
             ("black level", f"the dark level changes by {result.black.rms:.2g} DN from exposure to exposure")
         )
+    outcome += _of_the_set(result)
     return [Finding(check, text, None) for check, text in outcome]
+
+
+def _of_the_set(result: PairCalibration) -> list[tuple[str, str]]:
+    """What the captures are made of."""
+    pairs = result.pairs
+    outcome = []
+    if result.dark_noise_is_rounded_off:
+        text = (
+            f"the dark variance is down to {result.dark.variance.min():.3f} DN², below the 0.24 of EMVA 1288: rounding "
+            "hides the dark noise, which has an upper limit alone. Capture with more bits or a higher gain"
+        )
+        outcome.append(("dark noise", text))
+    if pairs.is_dark_once:
+        text = (
+            f"dark frames of one exposure, {1e6 * pairs.dark[0].exposure_s:g} µs, stand for those of all: the dark "
+            "current is not known and counts as light"
+        )
+        outcome.append(("dark frames", text))
+    if len(pairs.long) > 1:
+        text = (
+            f"of {len(pairs.long)} long series in the light, that of {pairs.spatial_lit.label}, nearest to half of "
+            "saturation, gives DSNU, PRNU and the maps; the others are not used"
+        )
+        outcome.append(("long series", text))
+    return outcome

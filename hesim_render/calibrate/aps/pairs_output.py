@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from hesim_render.calibrate.aps.long_series import Long
-from hesim_render.calibrate.aps.pairs import PairCalibration, evaluate
+from hesim_render.calibrate.aps.pairs import DARK_NOISE_LIMIT_DN, PairCalibration, evaluate
 from hesim_render.calibrate.aps.pairs_findings import SIGNIFICANT, findings
 from hesim_render.calibrate.aps.variance import TERMS
 from hesim_render.calibrate.estimate import Z_95, estimated, not_identifiable
@@ -153,14 +153,25 @@ def _quantum_efficiency(result: PairCalibration, relative: float) -> dict[str, A
 
 def _read_noise(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
     """Of pixels alone, at no exposure: without the ADC and without what rows, columns and lines share."""
+    if result.dark_noise_is_rounded_off:
+        return _upper_limit(k)
     variance = result.noise.value - result.lines_dn2 - ADC_VARIANCE_DN2
     noise = float(np.sqrt(variance))
     error = float(np.hypot(result.noise.error / (2 * variance), relative))
     return estimated(noise / k, noise / k * error, "e-", result.noise.groups) | {"value_dn": noise}
 
 
+def _upper_limit(k: float) -> dict[str, Any]:
+    """The standard's limit where rounding hides the noise."""
+    return not_identifiable("rounding hides it; capture with more bits or a higher gain") | {
+        "upper_limit": DARK_NOISE_LIMIT_DN / k, "unit": "e-",
+    }  # fmt: skip
+
+
 def _dark_noise(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
     """The standard's σ_d, with what rows and columns share."""
+    if result.dark_noise_is_rounded_off:
+        return _upper_limit(k)
     variance = result.noise.value - ADC_VARIANCE_DN2 + max(result.row[0], 0.0) + max(result.col[0], 0.0)
     error = float(np.sqrt(result.noise.error**2 + result.row[1] ** 2 + result.col[1] ** 2)) / (2 * variance)
     noise = float(np.sqrt(variance)) / k
