@@ -22,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import MOST_PIXELS, MOST_TEXT_BYTES, leads_out, printable, reading
+from hesim_render.core.guard import MOST_PIXELS, MOST_TEXT_BYTES, WholeFile, leads_out, printable, reading
 from hesim_render.recording.series import Series
 
 #: The name that the standard's own data sets give the list.
@@ -96,10 +96,7 @@ def read_list(file: Path, unit: str | None = None) -> tuple[int, tuple[int, int]
     SpecError
         With file and line, if a line has no such form, or a picture is missing or outside the folder.
     """
-    with reading(file):
-        if (size := file.stat().st_size) > MOST_TEXT_BYTES:
-            raise SpecError(f"holds {size / 1e6:.0f} MB; such files are small", file=file)
-        text = _decoded(file.read_bytes())
+    text = _decoded(WholeFile(file, MOST_TEXT_BYTES).read())
     shape: tuple[int, int] | None = None
     bit_depth: int | None = None
     series: list[Series] = []

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import MOST_PIXELS, reading, require_file_size, require_memory
+from hesim_render.core.guard import MOST_PIXELS, WholeFile, reading, require_memory
 from hesim_render.recording.camera_raw import read_raw
 
 PICTURE_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm")
@@ -142,9 +142,8 @@ def _read_pgm(file: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
     """A PGM file; its values are as stored, and not scaled by the largest value."""
     kind, size, largest, begin = _pgm_header(file)
     _require(file, "PGM", size, shape, True)
-    require_file_size(file)
+    data = WholeFile(file).read()[begin:]
     with reading(file, "as a PGM file"):
-        data = file.read_bytes()[begin:]
         if kind == "P2":
             values = np.array(re.sub(rb"#[^\r\n]*", b"", data).split(), np.int64)
         else:
