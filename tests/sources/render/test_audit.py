@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
+from scipy.special import logsumexp
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
@@ -197,6 +199,39 @@ def test_a_quarter_of_what_stands_still_is_looked_at(monkeypatch):
     assert rays[1] < 0.65 * rays[0]
 
 
+class WithFrames(Given):
+    """Its frames have other light and other noise than its event pixels; a tenth of the pixels is off in frames."""
+
+    def mean_flux(self, pixel, begin_us, end_us):
+        types = jit()
+        run = np.where(pixel % 10 == 3, 3.3e4, 3e4).astype(np.float32)
+        return types.Float(1.001 * run), types.Float(0.999 * run)
+
+    def noise_unit(self, pixel, flux, events):
+        return (UNIT if events else 2 * UNIT) * flux
+
+    def reference_flux(self, pixel, begin_us, end_us, quality, events):
+        assert quality == QUALITY / 2  # the reference is better than the run
+        found = super().reference_flux(pixel, begin_us, end_us, quality, events)
+        return found if events else np.stack([np.full(pixel.size, 3e4), np.zeros(pixel.size)])
+
+
+def test_frames_are_rendered_again_as_frames():
+    """10 % off in units of 6 % noise: 1.667 units, more than 3 · 0.5 wanted; ten of a hundred pixels are."""
+    truth, sensor = np.full((TICKS, ROWS * COLS), 1e5), sensor_of()
+    source, pixels = WithFrames(truth, truth), sensor.layout.evs_pixel.ravel()
+    noted = NotedFlux(source, pixels, TICKS, 1, *STRETCHES["previous_sample"], 3)
+    for _ in noted.flux_of_blocks(pixels, tick_blocks(sensor.spec.evs, 0, TICKS * TICK_US)):
+        pass
+    noted.mean_flux(np.arange(ROWS * COLS, dtype=np.uint32), 0.0, 500.0)
+    found = Audit(noted, source, QUALITY, sensor.evs, pixels, 3).run()
+    assert found["events"]["off"] == 0 and found["verdict"] == "not met"
+    frames = found["frames"]
+    assert frames["off"] == pytest.approx(np.mean(np.arange(ROWS * COLS) % 10 == 3), abs=0.02)
+    assert frames["deviation_noise"]["largest"] == pytest.approx(0.1 / (2 * UNIT), rel=1e-5)
+    assert frames["off_by_stated_error_alone"] == 0 and "missed" not in frames
+
+
 # ---- bounds -------------------------------------------------------------------------------------
 
 
@@ -211,6 +246,22 @@ def test_upper_and_lower_bounds_cover(share):
         low += lower_bound(values, 0.99) > 0.75 * share
     assert high <= 12 and low <= 12
     assert upper_bound(np.zeros(2000), 0.99) < 0.004 and lower_bound(np.ones(2000), 0.99) > 0.996
+
+
+@pytest.mark.parametrize(("draws", "confidence"), [(7, 0.9), (300, 0.99), (2_000_000, 0.995)])
+def test_the_bound_of_what_never_happened_is_where_the_capital_is_one_over_alpha(draws, confidence):
+    """Half of the capital at a stake of 0.99 and eight parts from 0.8 to 0.02: Σ p (1 + λ m)ⁿ = 1/α, to 0.1 %."""
+    stakes = np.array([0.99, *(0.8 * 40 ** (-np.arange(8) / 7))])
+    parts = np.array([0.5, *[1 / 16] * 8])
+    log_of = lambda m: logsumexp(draws * np.log1p(stakes * m), b=parts)  # noqa: E731
+    wanted = brentq(lambda m: log_of(m) + np.log(1 - confidence), 0, 5.0)
+    found = upper_bound(np.zeros(draws), confidence)
+    assert found == pytest.approx(min(wanted, 1.0), rel=1.1e-3)
+    assert lower_bound(np.ones(draws), confidence) == pytest.approx(1 - found)
+    # of a ratio one draw wins r · whole/most
+    whole = np.full(draws, 2.0)
+    assert ratio_upper_bound(0 * whole, whole, 3.0, confidence) == pytest.approx(min(1.5 * wanted, 1.0), rel=1.1e-3)
+    assert ratio_upper_bound(whole[:0], whole[:0], 3.0, confidence) == upper_bound(whole[:0], confidence) == 1.0
 
 
 def test_bounds_hold_whenever_one_stops():
