@@ -230,6 +230,10 @@ def test_frames_are_rendered_again_as_frames():
     assert frames["off"] == pytest.approx(np.mean(np.arange(ROWS * COLS) % 10 == 3), abs=0.02)
     assert frames["deviation_noise"]["largest"] == pytest.approx(0.1 / (2 * UNIT), rel=1e-5)
     assert frames["off_by_stated_error_alone"] == 0 and "missed" not in frames
+    # the limits that docs/rendering.md promises
+    assert found["confidence"] == 0.99 and found["tolerance_noise"] == 3 * QUALITY
+    limits = {name: value for name, value in found["events"].items() if name.endswith("wanted_at_most")}
+    assert limits == {"off_wanted_at_most": 0.02, "missed_wanted_at_most": 0.02, "extra_wanted_at_most": 0.01}
 
 
 # ---- bounds -------------------------------------------------------------------------------------
