@@ -261,7 +261,7 @@ def test_what_rows_and_columns_share_is_compared_by_means_over_the_exposures():
     for check, values, fitted in zip(comparison._shared(result, real, twin), (row, col), (0.11, 0.23), strict=True):
         some = values[:, [0, 1, 3]]
         wanted = np.sqrt(np.sum(some.var(axis=1, ddof=1) / 3) + fitted**2)
-        assert check.error == pytest.approx(wanted) and check.freedom == np.inf
+        assert check.error == pytest.approx(wanted) and check.freedom == np.inf and check.places.shape == (1,)
         assert (check.real[0], check.twin[0]) == pytest.approx(tuple(some.mean(axis=1)))
     real.dark.exposure_s = twin.dark.exposure_s = np.array([0.001, 0.004, 0.004, 0.004])
     assert [check.error[0] for check in comparison._shared(result, real, twin)] == pytest.approx([0.22, 0.46])
