@@ -88,6 +88,7 @@ def test_a_wrong_twin_fails_where_it_is_wrong(captures, tmp_path, monkeypatch, n
     monkeypatch.setattr(run, "load_sensor", lambda file: load_sensor(file, changes))
     twin = make_twin(captures, tmp_path / "out", seed=3)
     assert expected <= {check.name for check in twin.checks if not check.passed}
+    assert not twin.passed and json.loads((twin.folder / "twin.json").read_text(encoding="utf-8"))["passed"] is False
 
 
 def test_the_command_tells_each_check_and_its_status(captures, tmp_path):
@@ -352,3 +353,33 @@ def test_deviations_are_from_rows_columns_and_surroundings():
     assert np.median(found) == pytest.approx(0.6745 * 0.01, rel=0.1)
     far = np.abs(row - 17) + np.abs(col - 23) > 60
     np.testing.assert_allclose(found[far & (row != 17)], figures.deviations(plain)[far & (row != 17)], atol=0.02)
+
+
+def test_no_two_frames_of_a_bench_have_the_same_noise():
+    """Numbers of frames go on over pairs and series; a dark series is read twice, for its spectrum."""
+    drawn = []
+
+    def sample(electrons, exposure_us, seed, frame):
+        drawn.append((exposure_us, seed, frame))
+        return np.random.default_rng(frame).integers(40, 60, electrons.shape).astype(np.uint16)
+
+    result = SimpleNamespace(
+        responsivity=SimpleNamespace(slope=0.2), gain=SimpleNamespace(slope=0.5), curve=SimpleNamespace(offset=0.0)
+    )
+    bench = TwinBench(SimpleNamespace(aps=SimpleNamespace(sample=sample)), result, np.ones((12, 16)), 5)
+    series = lambda lit, count, s: SimpleNamespace(  # noqa: E731
+        lit=lit, files=[None] * count, exposure_s=s, photons=300.0 if lit else None, where=None
+    )
+    like = SimpleNamespace(
+        spatial_dark=series(False, 9, 0.004), spatial_lit=series(True, 11, 0.007), shape=(12, 16), has_photons=True,
+        spec=SimpleNamespace(full_scale_dn=1023),
+    )  # fmt: skip
+    list(bench.frames(0.0, 0.001, 2))
+    bench.long(like, False)
+    bench.long(like, True)
+    list(bench.frames(0.0, 0.001, 2))
+    own = [(0.001, 2), (0.004, 9), (0.004, 9), (0.007, 11), (0.001, 2)]
+    assert [t for t, *_ in drawn] == pytest.approx([1e6 * t for t, count in own for _ in range(count)])
+    numbers = [frame for *_, frame in drawn]
+    assert numbers == [1, 2, *range(3, 12), *range(3, 12), *range(12, 23), 23, 24]
+    assert {seed for _, seed, _ in drawn} == {5}
