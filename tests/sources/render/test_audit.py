@@ -236,6 +236,24 @@ def test_frames_are_rendered_again_as_frames():
     assert limits == {"off_wanted_at_most": 0.02, "missed_wanted_at_most": 0.02, "extra_wanted_at_most": 0.01}
 
 
+@pytest.mark.parametrize(("before", "core", "after"), STRETCHES.values())
+def test_every_tick_is_judged_equally_often_with_what_lies_around_it(before, core, after):
+    """Also the first ones and the last ones of a run, which have fewer windows around them."""
+    truth, sensor = np.full((TICKS, ROWS * COLS), 1e5), sensor_of()
+    pixels = sensor.layout.evs_pixel.ravel()
+    noted = NotedFlux(Given(truth, truth), pixels, TICKS, 1, before, core, after, 3)
+    for _ in noted.flux_of_blocks(pixels, tick_blocks(sensor.spec.evs, 0, TICKS * TICK_US)):
+        pass
+    judged = np.zeros(TICKS, int)
+    for units in noted.events:
+        tick = np.rint(units.end_us[:, 0] / TICK_US).astype(int) - 1
+        np.testing.assert_array_equal(np.diff(tick), 1)
+        mine = tick[units.core]
+        judged[mine] += units.pixel.size
+        assert tick[0] == max(mine[0] - before, 0) and tick[-1] == min(mine[-1] + after, TICKS - 1)
+    assert judged.min() == judged.max() > 0
+
+
 # ---- bounds -------------------------------------------------------------------------------------
 
 
