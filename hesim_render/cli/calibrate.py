@@ -18,6 +18,7 @@ from hesim_render.cli.options import (
     Without,
     cropped,
     names_of,
+    place_of,
     sensor_keys_only,
 )
 from hesim_render.cli.terminal import parse_exposures, parse_size, split_overrides
@@ -35,7 +36,7 @@ _Report = Annotated[Path | None, typer.Option(help="HTML report of all that the 
 @app.command()
 def lab(
     sensor: Annotated[str, typer.Argument(help=SENSOR_HELP, autocompletion=names_of("sensors"))],
-    out: Annotated[Path, typer.Option(help="folder to write the capture set to")],
+    out: Annotated[Path | None, typer.Option(help="folder to write the capture set to")] = None,
     roi: Annotated[
         str, typer.Option(help="WIDTHxHEIGHT or ...+X+Y, px, or 'full' (gigabytes of frames for a large sensor)")
     ] = "256x256",
@@ -67,7 +68,8 @@ def lab(
     scene_changes, changes = split_overrides(set_ or [])
     sensor_keys_only(scene_changes, "sensor.aps.read_noise_e")
     dark_us, lit_us = parse_exposures(dark_ms), parse_exposures(lit_ms)
-    check_target(out, "capture.yaml", overwrite)
+    place = place_of(out, dry_run)
+    check_target(place, "capture.yaml", overwrite)
     console = Console(json_, quiet, dry_run)
     with console.stop_at_estimate(), console.progress(f"lab {sensor}") as progress:
         from hesim_render.capture.lab import write_captures
@@ -75,12 +77,12 @@ def lab(
 
         loaded = cropped(load_sensor(sensor, changes), None if roi == "full" else roi)
         folder = write_captures(
-            loaded, out, frames=frames, ticks=ticks, trials=trials, parts=parts, seed=seed, without=without or (),
+            loaded, place, frames=frames, ticks=ticks, trials=trials, parts=parts, seed=seed, without=without or (),
             illuminant=illuminant, overwrite=overwrite, progress=progress,
             dark_exposures_us=dark_us, lit_exposures_us=lit_us, on_estimate=console.estimated(progress),
         )  # fmt: skip
     sizes = {file.name: file.stat().st_size for file in sorted(folder.iterdir())}
-    lines = [f"{size / 1e6:10.1f} MB  {out / name}" for name, size in sizes.items()]
+    lines = [f"{size / 1e6:10.1f} MB  {place / name}" for name, size in sizes.items()]
     console.result("\n".join(lines), {"captures": folder, "files_bytes": sizes})
 
 

@@ -5,15 +5,17 @@ Names of options in errors that the Python API raised with the names of its argu
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Sequence
 from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from uuid import uuid4
 
 import typer
 
 from hesim_render.cli.terminal import say
-from hesim_render.core.errors import HesimError, RangeError
+from hesim_render.core.errors import ConflictError, HesimError, RangeError
 from hesim_render.core.output import check_target
 from hesim_render.core.region import parse_roi
 
@@ -108,6 +110,21 @@ def check_output(out: Path, overwrite: bool) -> None:
     from hesim_render.recording.manifest import MANIFEST_NAME
 
     check_target(out, MANIFEST_NAME, overwrite)
+
+
+def place_of(out: Path | None, dry_run: bool) -> Path:
+    """The place of `--out`. A dry run, which writes nothing, also works without: its place is one that nothing has.
+
+    Raises
+    ------
+    ConflictError
+        If there is no place, and the run is not a dry one.
+    """
+    if out is not None:
+        return out
+    if not dry_run:
+        raise ConflictError("--out", None, "Missing option '--out': the folder to write to (or --dry-run)")
+    return Path(tempfile.gettempdir()) / f"dry-run-{uuid4().hex}"
 
 
 def sensor_keys_only(scene_changes: dict[str, object], example: str) -> None:

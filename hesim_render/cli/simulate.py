@@ -26,6 +26,7 @@ from hesim_render.cli.options import (
     check_output,
     listed,
     names_of,
+    place_of,
 )
 from hesim_render.cli.pictures import picture_place, write_framing, write_look
 from hesim_render.cli.terminal import split_overrides, summary
@@ -48,7 +49,9 @@ def simulate(
             autocompletion=names_of("scenes"),
         ),
     ],
-    out: Annotated[Path, typer.Option(help="folder to write to; the same command continues an interrupted run")],
+    out: Annotated[
+        Path | None, typer.Option(help="folder to write to; the same command continues an interrupted run")
+    ] = None,
     sensor: Annotated[str | None, typer.Option(help=SENSOR_HELP, autocompletion=names_of("sensors"))] = None,
     duration: Annotated[float | None, typer.Option(help="simulated time, s; default 0.1, of a video all of it")] = None,
     roi: Region = None,
@@ -132,19 +135,20 @@ def simulate(
     limits: dict[str, Any] = {"max_minutes": None if yes else LONG_MINUTES, "overwrite": overwrite}
     common = _given(seed=seed, clean=clean, without=without or [], duration_s=duration, live=live)
     rendered = _given(quality=quality, exact=exact, samples=samples, truth=listed(truth), truth_every_us=truth_every_us)
+    place = place_of(out, dry_run)
     if live and not dry_run:
-        _tell_live_file(console, out)
+        _tell_live_file(console, place)
     if kind is InputKind.recording:
-        _again(console, Path(given), out, scene_file, allow_outside, limits)
+        _again(console, Path(given), place, scene_file, allow_outside, limits)
     elif kind is InputKind.run:
         changes = keys | common | rendered | _given(sensor=sensor, roi=roi)
-        _run(console, Path(given), out, changes, sensor_keys, allow_outside, limits)
+        _run(console, Path(given), place, changes, sensor_keys, allow_outside, limits)
     elif sensor is None:
         raise ConflictError("--sensor", None, "Missing option '--sensor': the name or the file of one (info sensors)")
     elif framing or look is not None:
         if sum((framing, look is not None, dry_run)) > 1:
             raise ConflictError("--framing", framing, "give one of --framing, --look and --dry-run")
-        inputs, target = Inputs(given, sensor, keys, sensor_keys, roi, allow_outside), picture_place(out, overwrite)
+        inputs, target = Inputs(given, sensor, keys, sensor_keys, roi, allow_outside), picture_place(place, overwrite)
         if look is None:
             write_framing(console, inputs, target)
         else:
@@ -152,9 +156,9 @@ def simulate(
     else:
         inputs = Inputs(given, sensor, keys, sensor_keys, roi, allow_outside)
         if kind is InputKind.scene:
-            show_recording(console, _scene(console, inputs, out, **limits, **common, **rendered))
+            show_recording(console, _scene(console, inputs, place, **limits, **common, **rendered))
         else:
-            _pictures(console, kind, inputs, out, {**limits, **common})
+            _pictures(console, kind, inputs, place, {**limits, **common})
 
 
 def _tell_live_file(console: Console, out: Path) -> None:

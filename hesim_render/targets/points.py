@@ -82,7 +82,7 @@ def surface_points(target: TargetSpec, count: int) -> NDArray[np.float64]:
     """A grid of points over a target, row by row from the top left, before its tilt and shift, [count², 3], m."""
     x = np.linspace(-0.5, 0.5, count) * target.width_m
     y = np.linspace(0.5, -0.5, count) * target.height_m
-    flat = np.column_stack([np.tile(x, count), np.repeat(y, count), np.zeros(count**2)])
+    flat = np.column_stack([np.tile(x, count), np.repeat(y, count)])
     if target.bend_radius_m is None:
-        return flat
-    return on_cylinder(flat[:, :2], target.bend_radius_m)
+        return np.column_stack([flat, np.zeros(count**2)])
+    return on_cylinder(flat, target.bend_radius_m)

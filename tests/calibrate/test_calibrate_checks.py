@@ -249,6 +249,10 @@ def test_drift_of_black_and_of_light_are_told_apart_to_the_number():
     assert drift.black.variance == pytest.approx(black[1:].var(ddof=1), rel=0.05)
     assert drift.light.variance == pytest.approx(light[1:].var(ddof=1), rel=0.02)
     assert drift.light.p_value < 1e-100 and drift.black.p_value < 1e-100
+    # a dim half of less than 80 % of the bright one is needed to tell them apart
+    for dim, is_apart in ((0.802, False), (0.798, True)):
+        signal = np.array([dim * 450.0, 450.0])[half]
+        assert (common_mode.frame_drift(moments, 0, 0.0, signal).light is not None) is is_apart
 
 
 def events_of(folder, report=None, **keys):

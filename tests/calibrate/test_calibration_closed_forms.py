@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 import hesim_render as hr
 from hesim_render.calibrate.aps import checks as frame_checks
-from hesim_render.calibrate.aps import photon_transfer
+from hesim_render.calibrate.aps import photon_transfer, variance
 from hesim_render.calibrate.aps.composite import Composite, signal_at_event_pixels
 from hesim_render.calibrate.aps.dark import fit_dark
 from hesim_render.calibrate.aps.photon_transfer import _read_noise, linearity, system_gain
@@ -77,6 +77,22 @@ def test_variance_polynomial_is_exact_however_noisy_the_signals_are(tau):
     found = fit_variance(join([pooled(seconds, tau) for seconds in (0.01, 0.05, 0.2)]))
     np.testing.assert_allclose(found.beta, BETA, rtol=1e-6, atol=1e-12)
     assert found.identified.all() and found.quantised_pixels == 0
+
+
+@pytest.mark.parametrize(("alike", "kept"), [
+    (None, [1, 1, 1, 1, 1, 1]), ((5, 2), [1, 1, 1, 1, 1, 0]), ((4, 1), [1, 1, 1, 1, 0, 0]),
+    ((3, 0), [1, 1, 1, 0, 0, 0]), ((1, 0), [1, 0, 0, 0, 0, 0]),
+])  # fmt: skip
+def test_terms_are_kept_whatever_their_units_and_left_out_in_their_order(alike, kept):
+    """Two columns of the design that are one: terms go from t² on, until the rest is independent."""
+    design = np.random.default_rng(3).standard_normal((400, 6))
+    if alike is not None:
+        design[:, alike[0]] = design[:, alike[1]]
+    design *= 10.0 ** np.array([0, -9, 4, -14, 7, 12])
+    assert variance._identifiable(design.T @ design, []).tolist() == np.array(kept, bool).tolist()
+    without = np.array(kept, bool)
+    without[2] = False
+    assert variance._identifiable(design.T @ design, [2]).tolist()[:3] == without.tolist()[:3]
 
 
 @pytest.mark.parametrize("more", [0.99, 1.0, 1.01])

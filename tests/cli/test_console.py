@@ -50,7 +50,7 @@ def test_quiet_prints_nothing_and_errors_all_the_same(capsys, tmp_path):
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_dry_run_estimates_and_writes_nothing(options, moving, capsys, tmp_path):
     words = ["rotating-star" if word == "colorchecker" and moving else word for word in STILL]
-    status, out, _ = call(capsys, *words, *options, "--out", tmp_path / "o", "--dry-run", "--json")
+    status, out, _ = call(capsys, *words, *options, "--dry-run", "--json")  # no place is needed
     told = json.loads(out)
     assert status == 0 and told["dry_run"] is True and told["estimate"]["seconds"] > 0
     assert list(tmp_path.iterdir()) == []
@@ -128,6 +128,27 @@ def test_a_long_exact_run_has_to_be_wanted(capsys, tmp_path):
     )  # fmt: skip
     assert status == 2 and out.startswith("estimate: about ") and "or fewer rays, such as --samples 512" in line
     assert list(tmp_path.iterdir()) == []
+
+
+def test_only_a_dry_run_does_without_a_place(capsys, tmp_path, monkeypatch):
+    """Of each kind of input; nothing is left where temporary files go either."""
+    there, temporary = tmp_path / "there", tmp_path / "temporary"
+    there.mkdir(), temporary.mkdir()
+    monkeypatch.chdir(there)
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    assert call(capsys, *STILL, "--samples", "4", "--quiet", "--out", tmp_path / "o")[0] == ExitStatus.NOT_MET
+    (tmp_path / "run.yaml").write_text(
+        "schema_version: 1\nname: x\nscene: colorchecker\nsensor: reference-mono\nroi: 16x12\nduration_s: 0.02\n"
+    )
+    lab = ["calibrate", "lab", "reference-mono", "--roi", "16x12", "--frames", "8", "--ticks", "500"]
+    for words in (STILL, ["simulate", tmp_path / "o"], ["simulate", tmp_path / "run.yaml"], lab):
+        assert "Missing option '--out': the folder to write to (or --dry-run)" in fails(capsys, *words)
+        status, out, _ = call(capsys, *words, "--dry-run", "--json")
+        assert status == 0 and json.loads(out)["dry_run"] is True and json.loads(out)["estimate"]["text"]
+    for option in (["--framing"], ["--look", "0.01"]):
+        assert "give one of" in fails(capsys, *STILL, *option, "--dry-run")
+        assert "Missing option '--out'" in fails(capsys, *STILL, *option)
+    assert list(there.iterdir()) == list(temporary.iterdir()) == []
 
 
 def test_a_dry_run_of_a_video(capsys, tmp_path):

@@ -83,6 +83,9 @@ def test_a_normalised_voxel_grid_has_mean_0_and_deviation_1_where_it_is_filled()
     values = found[plain != 0].astype(float)
     assert values.mean() == pytest.approx(0, abs=1e-5) and values.std() == pytest.approx(1, abs=1e-5)
     assert np.all(found[plain == 0] == 0)
+    # equal values have no deviation: 0 each
+    alike = voxel_grid(EVENTS[:1], SHAPE, bins=1, normalise=True)
+    assert np.count_nonzero(voxel_grid(EVENTS[:1], SHAPE, bins=1)) == 1 and not alike.any()
 
 
 def test_rates_times_intervals_are_the_events():

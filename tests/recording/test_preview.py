@@ -171,6 +171,11 @@ def test_events_of_a_moving_scene_are_those_around_the_middle_of_the_frame(start
     monkeypatch.setattr(type(recording), "event_slice", lambda self, *span: asked.append(span) or slices(self, *span))
     panels = showcase.middle_views(recording)
     assert asked == [(first_us, first_us + 10_001)] and panels[1].caption.endswith("in 10 ms: ON orange, OFF blue")
+    # of a still scene all events, also where the recording goes on from another one
+    monkeypatch.setattr(showcase, "moves", lambda _: False)
+    recording.manifest["time"]["begin_us"] = 30_000
+    panels = showcase.middle_views(recording)
+    assert asked[1:] == [(30_000, 250_001)] and panels[1].caption.endswith("in 220 ms: ON orange, OFF blue")
 
 
 def test_moving_scene_gets_an_animation(tmp_path):

@@ -218,6 +218,19 @@ def written_labels(folder, blocks):
     return folder
 
 
+def test_the_first_and_the_last_label_are_changed_where_they_lie(tmp_path):
+    whole = EventLabels.of(list(label_blocks(70, 901))).as_block()
+    (tmp_path / "truth").mkdir()
+    writer = LabelFileWriter(tmp_path, (8, 8), 0, 10**9)
+    writer.append(whole)
+    wanted = np.array(whole.label)
+    wanted[[0, 5, -1]] = 4, 2, 3
+    writer._change(np.array([wanted.size - 1, 0, 5]), np.array([3, 4, 2], np.uint8))
+    writer._label.seek(0)
+    np.testing.assert_array_equal(np.frombuffer(writer._label.read(), np.uint8), wanted)
+    writer.abandon()
+
+
 def test_labels_written_block_by_block_are_those_written_at_once(tmp_path):
     blocks = list(label_blocks(70, 9_001))
     whole = EventLabels.of(blocks)

@@ -1,9 +1,11 @@
 """Damaged files of every kind: each costs one clear error, or is read. No traceback, no hang, no crash, no flood of
 memory. The mutations are a pure function of their numbers: a failure names what to run again."""
 
+import contextlib
 import json
 import os
 import selectors
+import signal
 import subprocess
 import sys
 import time
@@ -13,8 +15,9 @@ import foreign_folder
 import pytest
 
 HERE = Path(__file__).parent
-#: A try takes 0.05 to 0.5 s; longer than this is a hang.
-HANG_S = 20
+#: A try takes 0.05 to 0.5 s; more processor time than this is a hang, and so is to use none for as long as `STILL_S`.
+#: The time of a clock says nothing: it depends on what else the machine does.
+HANG_S, STILL_S, NONE_S = 20, 60, 0.5
 #: Tries of each subject in the whole run, 6010 in all.
 WHOLE = {
     "recording": 1300, "developed": 60, "aps": 250, "evs": 200, "trials": 150, "calibration": 240, "sensor": 300,
@@ -28,29 +31,53 @@ WHOLE = {
 PEAK_MB = 1500
 
 
+def processor_s(session):
+    """Processor time of all processes of a session, and of those of them that have ended, s."""
+    ticks = 0
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            fields = file.read_text().rpartition(") ")[2].split()  # from the state on: proc(5)
+            ticks += sum(map(int, fields[11:15])) if int(fields[3]) == session else 0
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def wait_for_line(child, ready, limit_s):
+    """The processor time until the child has written something or ended, s; None if it hangs."""
+    begin = latest = processor_s(child.pid)
+    moved = time.monotonic()
+    while not ready.select(0.5):
+        now = processor_s(child.pid)
+        if now - latest > NONE_S:
+            latest, moved = now, time.monotonic()
+        if now - begin > limit_s or time.monotonic() - moved > STILL_S:
+            return None
+    return max(0.0, processor_s(child.pid) - begin)
+
+
 def lines_of(*parts):
     """What fuzz.py prints; its end, of itself or by us, is the last line."""
     child = subprocess.Popen(
         [sys.executable, HERE / "fuzz.py", *parts], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": f"{HERE.parents[1]}:{HERE.parent / 'support'}"},
+        env={**os.environ, "PYTHONPATH": f"{HERE.parents[1]}:{HERE.parent / 'support'}"}, start_new_session=True,
     )  # fmt: skip
     try:
         with selectors.DefaultSelector() as ready:
             ready.register(child.stdout, selectors.EVENT_READ)
             while True:
-                waited = time.monotonic()
-                if not ready.select(HANG_S + 40):  # the first try of a subject waits for imports and valid files
+                # the first try of a subject waits for imports and valid files
+                seconds = wait_for_line(child, ready, HANG_S + 40)
+                if seconds is None:
                     yield {"end": "hang"}
                     return
                 line = child.stdout.readline()
                 if not line:
                     break
-                found = json.loads(line)
-                yield found | {"seconds": time.monotonic() - waited}
+                yield json.loads(line) | {"seconds": seconds}
         if child.wait(timeout=30):
             yield {"end": f"status {child.returncode}", "error": child.stderr.read().decode()[-2000:]}
     finally:
-        child.kill()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)
         child.communicate()
 
 
@@ -77,6 +104,25 @@ def check(parts, wanted):
     assert not bad, "\n".join(map(str, bad[:20]))
     assert wanted is None or sum(ends.values()) == wanted
     return ends
+
+
+@pytest.mark.parametrize(("code", "hangs"), [
+    ("import time; time.sleep(60)", True),
+    ("while True: pass", True),
+    ("import subprocess, sys; subprocess.run([sys.executable, '-c', 'while True: pass'])", True),
+    ("import time; time.sleep(0.7); print('late')", False),
+])  # fmt: skip
+def test_a_hang_is_told_by_processor_time(code, hangs, monkeypatch):
+    """Of what sleeps, of what never ends, and of its children."""
+    monkeypatch.setattr("test_fuzz.STILL_S", 2 if hangs else 60)
+    child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, start_new_session=True)
+    try:
+        with selectors.DefaultSelector() as ready:
+            ready.register(child.stdout, selectors.EVENT_READ)
+            assert (wait_for_line(child, ready, 0.6) is None) is hangs
+    finally:
+        os.killpg(child.pid, signal.SIGKILL)
+        child.communicate()
 
 
 def test_pipes_devices_and_folders_in_place_of_files():

@@ -145,6 +145,18 @@ def test_cave_folders(tmp_path):
         open_cube(tmp_path)
 
 
+def test_exr_whose_bands_have_other_pixels_is_refused(tmp_path):
+    """One band of three has half as many columns and rows."""
+    plane = np.full((8, 12), 0.3, np.float32)
+    OpenEXR.File({}, {f"w{nm}nm": plane for nm in (400, 500, 600)}).write(str(tmp_path / "even.exr"))
+    whole = (tmp_path / "even.exr").read_bytes()
+    place = whole.index(b"w500nm\0") + len(b"w500nm\0") + 8  # behind type, flag and 3 bytes: x and y sampling
+    assert whole[place : place + 8] == np.array([1, 1], "<i4").tobytes()
+    (tmp_path / "uneven.exr").write_bytes(whole[:place] + np.array([2, 2], "<i4").tobytes() + whole[place + 8 :])
+    with pytest.raises(SpecError, match="its channels do not have the same pixels"):
+        open_cube(tmp_path / "uneven.exr")
+
+
 def test_exr_of_kaist_and_of_the_renderer(tmp_path):
     bands = 420 + 10.0 * np.arange(31)
     channels = {f"w{band:.0f}nm": np.ascontiguousarray(CUBE[..., k]) for k, band in enumerate(bands)}

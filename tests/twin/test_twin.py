@@ -13,11 +13,13 @@ from scipy.stats import kstest
 from typer.testing import CliRunner
 
 from hesim_render.calibrate import calibrate_aps, read_calibration
+from hesim_render.calibrate.aps.long_series import Long
 from hesim_render.calibrate.aps.pairs import evaluate
+from hesim_render.calibrate.aps.spatial import Temporal
 from hesim_render.cli.commands import app
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.recording.pair_set import read_pair_set
-from hesim_render.twin import figures, make_twin
+from hesim_render.twin import comparison, figures, make_twin
 from hesim_render.twin.comparison import Check
 from hesim_render.twin.figures import bin_edges, counts_in, spectrum
 from hesim_render.twin.simulated import TwinBench
@@ -86,6 +88,7 @@ def test_a_wrong_twin_fails_where_it_is_wrong(captures, tmp_path, monkeypatch, n
     monkeypatch.setattr(run, "load_sensor", lambda file: load_sensor(file, changes))
     twin = make_twin(captures, tmp_path / "out", seed=3)
     assert expected <= {check.name for check in twin.checks if not check.passed}
+    assert not twin.passed and json.loads((twin.folder / "twin.json").read_text(encoding="utf-8"))["passed"] is False
 
 
 def test_the_command_tells_each_check_and_its_status(captures, tmp_path):
@@ -185,3 +188,198 @@ def test_spectra_have_their_frequencies_and_the_noise_of_the_other_direction(mon
     figures.spectra(series, 2.0)
     assert [axis for *_, axis in given] == [1, 0]
     assert np.ravel([noise for *noise, _ in given]) == pytest.approx([0.12, 0.015 - 0.12 / 10, 0.12, 0.02 - 0.12 / 16])
+
+
+def test_errors_of_lit_and_dark_checks_are_sums_of_squares_by_hand():
+    """Unlike numbers in every part: bench, fit, and noise of captures and of twin; of five levels three are compared,
+    as the twin saturates in one and one is brighter than the fitted light by more than 5 %."""
+    t = np.array([0.002, 0.007, 0.002, 0.011, 0.005])
+    levels = lambda **given: SimpleNamespace(exposure_s=t, **given)  # noqa: E731
+    light = np.array([100.0, 250.0, 820.0, 850.0, 400.0])
+    real = SimpleNamespace(
+        lit=levels(photons=light, clear=np.ones(5, bool), mean=np.array([54.0, 130.0, 409.0, 1, 1]),
+                   variance=np.array([21.0, 53.0, 160.0, 1, 1]), error=np.array([0.3, 0.5, 1.1, 1, 1])),
+        dark=levels(mean=np.array([40.0, 41, 40, 43, 42]), variance=np.array([9.0, 9.5, 9.0, 9.9, 9.2]),
+                    error=np.array([0.10, 0.13, 0.10, 0.19, 0.11])),
+    )  # fmt: skip
+    twin = SimpleNamespace(
+        lit=levels(photons=light, clear=np.array([1, 1, 1, 1, 0], bool), mean=np.array([53.0, 128.0, 413.0, 2, 2]),
+                   variance=np.array([22.0, 50.0, 166.0, 2, 2]), error=np.array([0.2, 0.7, 0.9, 2, 2])),
+        dark=levels(mean=np.array([40.5, 41.2, 40, 43.4, 41]), variance=np.array([9.1, 9.2, 9.0, 9.5, 9.6]),
+                    error=np.array([0.07, 0.09, 0.07, 0.23, 0.17])),
+    )  # fmt: skip
+    root = np.random.default_rng(4).standard_normal((6, 6)) * np.array([1, 0.1, 30, 0.01, 2, 500])
+    beta = np.array([8.7, 0.37, 60.0, 1e-4, 0.9, 800.0])
+    result = SimpleNamespace(
+        light=np.array([90.0, 150, 200, 260, 300, 500, 800, 999]), clear=np.arange(8) < 7, row=(0.6, 0.05),
+        curve=SimpleNamespace(at=lambda x: 0.5 * x + 3, error=lambda x: 1e-3 * x, light_rms=0.004,
+                              covariance=np.diag([0.1, 0.2, 0.0])),
+        black=SimpleNamespace(rms=0.21, error_at=lambda s: 0.03 + 4 * s, groups=4), level_rms=0.013,
+        noise=SimpleNamespace(rms=0.08, error_at=lambda s: 0.02 + 3 * s),
+        fit=SimpleNamespace(covariance=root.T @ root, beta=beta, identified=np.array([1, 1, 1, 1, 0, 0], bool)),
+    )  # fmt: skip
+    held = SimpleNamespace(shape=(6, 10), has_photons=True)
+    found = {check.name: check for check in comparison._temporal(result, held, real, twin)}
+
+    use, s = slice(0, 3), t[:3]
+    x = 0.5 * light[use] + 3
+    lit = found["mean, lit"]
+    np.testing.assert_array_equal(lit.places, light[use])
+    own = real.lit.variance[use] / 60 + 0.6 / 6
+    wanted = np.sqrt((0.004 * x) ** 2 + 0.21**2 + (1e-3 * light[use]) ** 2 + (0.03 + 4 * s) ** 2 + own)
+    np.testing.assert_allclose(lit.error, wanted, rtol=1e-12)
+    np.testing.assert_allclose(lit.z, (twin.lit.mean - real.lit.mean)[use] / wanted, rtol=1e-12)
+    design = [np.ones(3), x, s, x**2, x * s, s**2]  # 1, I, t, I², I t, t²
+    slope = np.stack(design, axis=1)
+    of_fit = np.diag(slope @ result.fit.covariance @ slope.T)
+    wanted = np.sqrt(
+        real.lit.error[use] ** 2 + twin.lit.error[use] ** 2 + of_fit + (0.013 * (slope @ beta)) ** 2 + 2 * 0.08**2
+    )
+    np.testing.assert_allclose(found["temporal variance, lit"].error, wanted, rtol=1e-10)
+    # seven clear levels less two terms of the curve, or three of the polynomial beyond the constant
+    assert found["mean, lit"].freedom == found["temporal variance, lit"].freedom == 4
+
+    once = [0, 4, 1, 3]  # each exposure, in their order
+    np.testing.assert_allclose(found["mean, dark"].places, [2, 5, 7, 11])
+    wanted = np.sqrt(2 * 0.21**2 + (0.03 + 4 * t[once]) ** 2)
+    np.testing.assert_allclose(found["mean, dark"].error, wanted, rtol=1e-12)
+    wanted = np.sqrt(real.dark.error[once] ** 2 + twin.dark.error[once] ** 2 + 2 * 0.08**2 + (0.02 + 3 * t[once]) ** 2)
+    dark = found["temporal variance, dark"]
+    np.testing.assert_allclose(dark.error, wanted, rtol=1e-12)
+    np.testing.assert_array_equal(dark.twin - dark.real, (twin.dark.variance - real.dark.variance)[once])
+    assert dark.freedom == found["mean, dark"].freedom == 3
+
+
+def test_what_rows_and_columns_share_is_compared_by_means_over_the_exposures():
+    """Errors of both means and of the fit; of two exposures, whose scatter tells too little, twice that of the fit."""
+    t = np.array([0.001, 0.004, 0.004, 0.009])
+    row, col = (
+        np.array([[1.0, 2.0, 7.0, 1.6], [1.5, 2.5, 9.0, 2.9]]),
+        np.array([[0.1, 0.7, 3, 0.3], [0.2, 0.4, 5, 0.9]]),
+    )
+    real, twin = (SimpleNamespace(dark=SimpleNamespace(exposure_s=t, row=row[k], col=col[k])) for k in (0, 1))
+    result = SimpleNamespace(row=(0.0, 0.11), col=(0.0, 0.23))
+    for check, values, fitted in zip(comparison._shared(result, real, twin), (row, col), (0.11, 0.23), strict=True):
+        some = values[:, [0, 1, 3]]
+        wanted = np.sqrt(np.sum(some.var(axis=1, ddof=1) / 3) + fitted**2)
+        assert check.error == pytest.approx(wanted) and check.freedom == np.inf and check.places.shape == (1,)
+        assert (check.real[0], check.twin[0]) == pytest.approx(tuple(some.mean(axis=1)))
+    real.dark.exposure_s = twin.dark.exposure_s = np.array([0.001, 0.004, 0.004, 0.004])
+    assert [check.error[0] for check in comparison._shared(result, real, twin)] == pytest.approx([0.22, 0.46])
+
+
+def test_spatial_checks_are_relative_to_each_ones_own_signal(monkeypatch):
+    """Variances of lit series are divided by the square of the signal, and so are their errors; all three add up."""
+    rng = np.random.default_rng(3)
+    errors = {name: rng.uniform(1, 2, 4) for name in ("real", "twin", "own")}
+
+    def half(name, dark, lit):
+        def series(level, parts):
+            spatial = SimpleNamespace(
+                parts=parts, total=sum(parts), errors=lambda fixed: errors[name] if fixed else None
+            )
+            return SimpleNamespace(spatial=spatial, mean=level + rng.standard_normal((20, 30)))
+
+        return comparison.Half(None, None, series(dark, (0.3, 0.2, 1.1)), series(lit, (0.7, 0.4, 2.3)))
+
+    real, twin, own = half("real", 30, 130), half("twin", 40, 240), half("own", 20, 170)
+    powers = []
+
+    def spectra(series, scale):
+        powers.append(scale)
+        some = figures.SpatialSpectrum(np.array([0.1, 0.2]), np.array([1.0, 2.0]), np.array([3.0, 4.0]) * len(powers))
+        return {"rows": some, "columns": some}
+
+    monkeypatch.setattr(comparison, "without_lines", lambda series, _: series)
+    monkeypatch.setattr(comparison, "spectra", spectra)
+    result = SimpleNamespace(lit=None, dark=None, long_dark=own.long_dark, long_lit=own.long_lit, noise_spectrum=None)
+    found = {check.name: check for check in comparison._spatial(result, real, twin)}
+    signal = [h.long_lit.mean.mean() - h.long_dark.mean.mean() for h in (real, twin, own)]
+    assert powers == pytest.approx([1, 1, 1, *signal])
+    for k, (part, value) in enumerate((("row", 0.7), ("column", 0.4), ("pixel", 2.3), ("total", 3.4))):
+        check = found[f"spatial variance, {part}, lit"]
+        assert (check.real[0], check.twin[0]) == pytest.approx((value / signal[0] ** 2, value / signal[1] ** 2))
+        each = [errors[name][k] / f**2 for name, f in zip(("real", "twin", "own"), signal, strict=True)]
+        assert check.error[0] == pytest.approx(np.sqrt(np.sum(np.square(each))))
+        dark = found[f"spatial variance, {part}, dark"]
+        assert dark.error[0] == pytest.approx(np.sqrt(sum(values[k] ** 2 for values in errors.values())))
+    np.testing.assert_allclose(found["spectrum of rows, dark"].error, np.sqrt(1 + 4 + 9) * np.array([3, 4]))
+    counts = found["defects, histogram, lit"]
+    assert counts.real.sum() == counts.twin.sum() == 600
+    np.testing.assert_allclose(counts.error, np.sqrt(np.maximum(counts.real + counts.twin, 1)))
+
+
+def test_interference_is_taken_out_of_image_and_noise():
+    """A wave of 3 and 5 periods in a picture of 12 by 20, and one of half a period a column: nothing else is lost."""
+    rng = np.random.default_rng(6)
+    row, col = np.mgrid[:12, :20]
+    rest = np.fft.rfft2(rng.standard_normal((12, 20)))
+    rest[3, 5] = rest[2, 10] = rest[-2, 10] = 0
+    rest = np.fft.irfft2(rest, (12, 20))
+    waves = 0.7 * np.cos(2 * np.pi * (3 * row / 12 + 5 * col / 20) + 0.4)
+    waves += 0.5 * np.cos(2 * np.pi * 2 * row / 12 + 0.2) * (-1.0) ** col
+    lines = [
+        SimpleNamespace(cycles_per_row=3 / 12, cycles_per_col=5 / 20, rms_dn=0.9),
+        SimpleNamespace(cycles_per_row=2 / 12, cycles_per_col=0.5, rms_dn=0.6),
+    ]
+    temporal = Temporal(4.0, 0.3, 0.2, 0.0, 0.1, 0.1)
+    series = Long(
+        mean=rest + waves,
+        spatial=None,
+        temporal=temporal,
+        variance=None,
+        first=None,
+        frames=14,
+        levels=None,
+        spectrum=None,
+    )
+    found = figures.without_lines(series, SimpleNamespace(lines=lines))
+    np.testing.assert_allclose(found.mean, rest, atol=1e-12)
+    assert found.temporal.pixel == 4.0
+    assert found.spatial.noise[2] == pytest.approx((4.0 - 0.9**2 - 0.6**2) / 14)
+
+
+def test_deviations_are_from_rows_columns_and_surroundings():
+    """Rows, columns and a slope leave nothing; one bright pixel deviates by itself, less its part of row and column."""
+    row, col = np.mgrid[:40, :50]
+    image = 0.3 * (row % 7) + 0.2 * (col % 3) + 11.0
+    np.testing.assert_allclose(figures.deviations(image), 0, atol=1e-12)
+    noise = 0.01 * np.random.default_rng(2).standard_normal(image.shape)
+    plain, image = image + noise, image + noise
+    image[17, 23] += 6.0
+    found = figures.deviations(image)
+    # clipped at five deviations it adds 5 · 0.01/225 to its own surroundings
+    assert found[17, 23] == pytest.approx(6.0 * (1 - 1 / 40 - 1 / 50 + 1 / 2000), abs=0.05)
+    assert np.median(found) == pytest.approx(0.6745 * 0.01, rel=0.1)
+    far = np.abs(row - 17) + np.abs(col - 23) > 60
+    np.testing.assert_allclose(found[far & (row != 17)], figures.deviations(plain)[far & (row != 17)], atol=0.02)
+
+
+def test_no_two_frames_of_a_bench_have_the_same_noise():
+    """Numbers of frames go on over pairs and series; a dark series is read twice, for its spectrum."""
+    drawn = []
+
+    def sample(electrons, exposure_us, seed, frame):
+        drawn.append((exposure_us, seed, frame))
+        return np.random.default_rng(frame).integers(40, 60, electrons.shape).astype(np.uint16)
+
+    result = SimpleNamespace(
+        responsivity=SimpleNamespace(slope=0.2), gain=SimpleNamespace(slope=0.5), curve=SimpleNamespace(offset=0.0)
+    )
+    bench = TwinBench(SimpleNamespace(aps=SimpleNamespace(sample=sample)), result, np.ones((12, 16)), 5)
+    series = lambda lit, count, s: SimpleNamespace(  # noqa: E731
+        lit=lit, files=[None] * count, exposure_s=s, photons=300.0 if lit else None, where=None
+    )
+    like = SimpleNamespace(
+        spatial_dark=series(False, 9, 0.004), spatial_lit=series(True, 11, 0.007), shape=(12, 16), has_photons=True,
+        spec=SimpleNamespace(full_scale_dn=1023),
+    )  # fmt: skip
+    list(bench.frames(0.0, 0.001, 2))
+    bench.long(like, False)
+    bench.long(like, True)
+    list(bench.frames(0.0, 0.001, 2))
+    own = [(0.001, 2), (0.004, 9), (0.004, 9), (0.007, 11), (0.001, 2)]
+    assert [t for t, *_ in drawn] == pytest.approx([1e6 * t for t, count in own for _ in range(count)])
+    numbers = [frame for *_, frame in drawn]
+    assert numbers == [1, 2, *range(3, 12), *range(3, 12), *range(12, 23), 23, 24]
+    assert {seed for _, seed, _ in drawn} == {5}

@@ -201,7 +201,6 @@ def mean_curve(light: NDArray, signal: NDArray, error_dn: NDArray) -> MeanCurve:
                 free, best, squares = trial, result, less
         dof = h.size - int(free.sum())
         residual = signal - _value(best, h)
-        excess = float(np.sum(residual**2 / signal**2) - np.sum(error_dn**2 / signal**2)) / dof
         # levels of little light would decide alone: the scatter of the light is that of the brighter half
         bright = signal >= np.median(signal)
         excess = float(np.mean(residual[bright] ** 2 / signal[bright] ** 2)) * h.size / dof

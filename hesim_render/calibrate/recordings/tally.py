@@ -158,7 +158,6 @@ class EventTally:
         """Count the last window."""
         if self._in_window:
             self._count_windows(np.array([self._in_window]))
-            self._in_window = 0
 
     def per_pixel(self) -> NDArray[np.int64]:
         """Events [polarity, pixel]."""

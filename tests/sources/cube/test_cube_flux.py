@@ -176,3 +176,17 @@ def test_bad_options_are_one_clear_line(tmp_path, options, message):
     with pytest.raises((RangeError, SpecError), match=message) as caught:
         hr.simulate_cube(path, hr.load_sensor("reference-mono").crop(8, 8), duration_s=0.01, **given)
     assert "\n" not in str(caught.value)
+
+
+def test_a_cube_that_ends_early_holds_only_where_that_is_wanted(tmp_path):
+    """Bands of 450 to 650 nm of reflectance 0.2, 0.4 at the red end, held beyond, as in a cube of all wavelengths."""
+    short, sensor = np.arange(450.0, 651.0, 10.0), hr.load_sensor(RGGB).crop(12, 8)
+    values = np.where(short > 645, 0.4, 0.2).astype(np.float32)
+    whole = np.interp(BANDS, short, values).astype(np.float32)
+    # bands at 640 and 650 nm are in both grids
+    expected = image(flux_of(saved(tmp_path, np.broadcast_to(whole, (8, 12, BANDS.size)).copy()), sensor))
+    path = saved(tmp_path, np.broadcast_to(values, (8, 12, short.size)).copy())
+    given = {"wavelength_nm": short.tolist()}
+    np.testing.assert_allclose(image(flux_of(path, sensor, beyond="hold", **given)), expected, rtol=1e-5)
+    with pytest.raises(SpecError, match="or let its ends hold"):
+        flux_of(path, sensor, **given)

@@ -1,5 +1,7 @@
 """Rays aimed at objects smaller than a pixel: the same flux as that of uniform rays, with a much smaller error."""
 
+from types import SimpleNamespace
+
 import hidden_scenes
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven import retrace
-from hesim_render.sources.render.change_driven.aim import Aims, PairAims, in_blocks
+from hesim_render.sources.render.change_driven.aim import Aims, PairAims, ball_around, in_blocks
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -234,3 +236,16 @@ def test_a_point_is_seen_where_its_ray_comes_from():
     np.testing.assert_allclose(found_row, row + np.array(aside[1]), atol=1e-3)
     assert np.all(np.array(scale) > 0)
     assert np.all(np.array(rays.seen(origin - direction)[2]) == 0)
+
+
+@pytest.mark.parametrize("kind", ["corners", "one ball", "a ball and faces"])
+def test_the_ball_around_an_object_touches_its_corners(kind):
+    """Half of the diagonal of its box; of one ball alone half of the largest side."""
+    corners = np.array([[0.1, 0.2, -1.0], [0.5, -0.4, 0.7], [0.3, 0.8, 0.2]])
+    forms = {
+        "corners": None, "one ball": SimpleNamespace(balls=[1], faces=[]),
+        "a ball and faces": SimpleNamespace(balls=[1], faces=[2]),
+    }  # fmt: skip
+    found = ball_around(SimpleNamespace(corners=corners, part=SimpleNamespace(form=forms[kind])))
+    radius = 1.7 / 2 if kind == "one ball" else np.sqrt(0.4**2 + 1.2**2 + 1.7**2) / 2
+    assert found == pytest.approx((0.3, 0.2, -0.15, radius))

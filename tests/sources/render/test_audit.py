@@ -1,7 +1,11 @@
 """The audit's bounds: coverage where misses come in clusters, in calm and in busy places; and what it counts."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from scipy.optimize import brentq
+from scipy.special import logsumexp
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
@@ -11,16 +15,15 @@ from hesim_render.sources.render.audit import audit as audit_module
 from hesim_render.sources.render.audit.audit import STRETCHES, Audit
 from hesim_render.sources.render.audit.compare import Tally, compare_crossings, compare_ticks
 from hesim_render.sources.render.audit.confidence import lower_bound, ratio_upper_bound, upper_bound
+from hesim_render.sources.render.audit.tally import Tally
 from hesim_render.sources.render.audit.units import NotedFlux
 
 ROWS, COLS, TICKS, TICK_US = 24, 32, 120, 1000
 QUALITY, UNIT = 0.5, 0.03
 
 
-def sensor_of(reference="previous_sample"):
-    changes = {"evs.contrast_threshold_on": 0.2, "evs.contrast_threshold_off": 0.27, "evs.reference": reference}
-    if reference == "last_event":
-        changes |= {"evs.tick_us": None, "evs.window_us": 1}
+def sensor_of():
+    changes = {"evs.contrast_threshold_on": 0.2, "evs.contrast_threshold_off": 0.27}
     return hr.load_sensor("reference-mono", changes).crop(COLS, ROWS)
 
 
@@ -197,6 +200,134 @@ def test_a_quarter_of_what_stands_still_is_looked_at(monkeypatch):
     assert rays[1] < 0.65 * rays[0]
 
 
+class WithFrames(Given):
+    """Its frames have other light and other noise than its event pixels; a tenth of the pixels is off in frames."""
+
+    def mean_flux(self, pixel, begin_us, end_us):
+        types = jit()
+        run = np.where(pixel % 10 == 3, 3.3e4, 3e4).astype(np.float32)
+        return types.Float(1.001 * run), types.Float(0.999 * run)
+
+    def noise_unit(self, pixel, flux, events):
+        return (UNIT if events else 2 * UNIT) * flux
+
+    def reference_flux(self, pixel, begin_us, end_us, quality, events):
+        assert quality == QUALITY / 2  # the reference is better than the run
+        found = super().reference_flux(pixel, begin_us, end_us, quality, events)
+        return found if events else np.stack([np.full(pixel.size, 3e4), np.zeros(pixel.size)])
+
+
+def test_frames_are_rendered_again_as_frames():
+    """10 % off in units of 6 % noise: 1.667 units, more than 3 · 0.5 wanted; ten of a hundred pixels are."""
+    truth, sensor = np.full((TICKS, ROWS * COLS), 1e5), sensor_of()
+    source, pixels = WithFrames(truth, truth), sensor.layout.evs_pixel.ravel()
+    noted = NotedFlux(source, pixels, TICKS, 1, *STRETCHES["previous_sample"], 3)
+    for _ in noted.flux_of_blocks(pixels, tick_blocks(sensor.spec.evs, 0, TICKS * TICK_US)):
+        pass
+    noted.mean_flux(np.arange(ROWS * COLS, dtype=np.uint32), 0.0, 500.0)
+    found = Audit(noted, source, QUALITY, sensor.evs, pixels, 3).run()
+    assert found["events"]["off"] == 0 and found["verdict"] == "not met"
+    frames = found["frames"]
+    assert frames["off"] == pytest.approx(np.mean(np.arange(ROWS * COLS) % 10 == 3), abs=0.02)
+    assert frames["deviation_noise"]["largest"] == pytest.approx(0.1 / (2 * UNIT), rel=1e-5)
+    assert frames["off_by_stated_error_alone"] == 0 and "missed" not in frames
+    # the limits that docs/rendering.md promises
+    assert found["confidence"] == 0.99 and found["tolerance_noise"] == 3 * QUALITY
+    limits = {name: value for name, value in found["events"].items() if name.endswith("wanted_at_most")}
+    assert limits == {"off_wanted_at_most": 0.02, "missed_wanted_at_most": 0.02, "extra_wanted_at_most": 0.01}
+
+
+@pytest.mark.parametrize(("before", "core", "after"), STRETCHES.values())
+def test_every_tick_is_judged_equally_often_with_what_lies_around_it(before, core, after):
+    """Also the first ones and the last ones of a run, which have fewer windows around them."""
+    truth, sensor = np.full((TICKS, ROWS * COLS), 1e5), sensor_of()
+    pixels = sensor.layout.evs_pixel.ravel()
+    noted = NotedFlux(Given(truth, truth), pixels, TICKS, 1, before, core, after, 3)
+    for _ in noted.flux_of_blocks(pixels, tick_blocks(sensor.spec.evs, 0, TICKS * TICK_US)):
+        pass
+    judged = np.zeros(TICKS, int)
+    for units in noted.events:
+        tick = np.rint(units.end_us[:, 0] / TICK_US).astype(int) - 1
+        np.testing.assert_array_equal(np.diff(tick), 1)
+        mine = tick[units.core]
+        judged[mine] += units.pixel.size
+        assert tick[0] == max(mine[0] - before, 0) and tick[-1] == min(mine[-1] + after, TICKS - 1)
+    assert judged.min() == judged.max() > 0
+
+
+@pytest.mark.parametrize(("reference", "most"), [("previous_sample", 1), ("last_event", 8)])
+def test_estimates_and_bounds_are_those_of_sums_over_units(reference, most):
+    """Of 900 units the first 600 were searched for events, the first 400 looked at in full; a still one counts four
+    times. Both bounds of the missed share hold together: each has half of the 1 %.
+    """
+    rng, tally = np.random.default_rng(4), Tally(900)
+    tally.has_event[:] = rng.random(900) < 0.3
+    tally.eventful, tally.looked_at = 600, 400
+    tally.off[:], tally.expected[:] = rng.choice([0, 1.0, 4.0], (2, 900), p=[0.9, 0.07, 0.03])
+    for values, chance in zip(vars(tally.events).values(), (0.5, 0.5, 0.1, 0.07, 0.2), strict=True):
+        values[:] = (rng.random(900) < chance) * rng.integers(1, 12, 900)
+    tally.events.true[~tally.has_event] *= rng.random(900)[~tally.has_event] < 0.1
+    tally.by_error[:] = rng.random(900) < 0.2
+    place, weight = np.arange(420), np.where(np.arange(420) % 7 == 0, 4.0, 1.0)
+    deviation = rng.exponential(size=(2, 420))
+    tally.note(place, deviation, weight)
+    noise = SimpleNamespace(spec=SimpleNamespace(reference=reference))
+    found = Audit(None, None, QUALITY, noise, np.arange(3), 1)._bounds(tally, True)
+
+    assert found["units"] == 400
+    assert found["off"] == pytest.approx(tally.off[:400].mean())
+    assert found["off_at_most"] == pytest.approx(min(1, 4 * upper_bound(tally.off[:400] / 4, 0.99)))
+    assert found["off_by_stated_error_alone"] == pytest.approx(tally.expected[:400].mean())
+    every, weights = deviation[:, :400].ravel(), np.tile(weight[:400], 2)
+    told = found["deviation_noise"]
+    assert told["rms"] == pytest.approx(np.sqrt(np.average(every**2, weights=weights)))
+    assert told["largest"] == every.max()
+    repeated = np.sort(np.repeat(every, weights.astype(int)))
+    for name, share in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
+        assert told[name] == repeated[int(np.ceil(share * repeated.size)) - 1]
+
+    def rate(values):
+        return (values * tally.has_event)[:600].sum() / 600 + (values * ~tally.has_event)[:400].sum() / 400
+
+    counts = tally.events
+    assert found["true_events"] == counts.true.sum() and found["found_events"] == counts.in_run.sum()
+    assert found["missed"] == pytest.approx(rate(counts.missed) / rate(counts.true))
+    assert found["extra"] == pytest.approx(rate(counts.extra) / rate(counts.in_run))
+    assert found["flips"] == pytest.approx(rate(counts.flips) / rate(counts.true))
+    assert found["flips_by_stated_error"] == pytest.approx(rate(tally.by_error) / rate(counts.true))
+    seen = tally.has_event[:600]
+    at_least = lower_bound(np.minimum(counts.true[:600], most) * seen / most, 0.995)
+    missed = upper_bound(np.minimum(counts.missed[:400], most) / most, 0.995)
+    assert found["missed_at_most"] == pytest.approx(min(1, missed / at_least)) and at_least > 0
+    part, whole = (np.minimum(values[:600][seen], most) for values in (counts.extra, counts.in_run))
+    assert found["extra_at_most"] == pytest.approx(ratio_upper_bound(part, whole, most, 0.99))
+
+
+def test_the_verdict_is_that_of_the_worst_share():
+    """Each share at its limit is met by its bound; the quality that is needed has 99 % below three of it."""
+    judge = Audit(None, None, 0.4, None, np.arange(3), 1)._verdict
+
+    def part(off=0.0, bound=0.02, p99=0.8, **events):
+        return {"off": off, "off_at_most": bound, "off_wanted_at_most": 0.02, "deviation_noise": {"p99": p99}, **events}
+
+    def of_events(name, share, bound, limit):
+        return {f"{name}": share, f"{name}_at_most": bound, f"{name}_wanted_at_most": limit}
+
+    fine = {"true_events": 3.0, "found_events": 2.0} | of_events("missed", 0.0, 0.02, 0.02)
+    fine |= of_events("extra", 0.0, 0.01, 0.01)
+    assert judge([part(**fine), part()]) == {"verdict": "met", "quality_needed": None}
+    assert judge([part(**fine), part(bound=0.0201)])["verdict"] == "not shown"
+    assert judge([part(off=0.02, bound=0.02)])["verdict"] == "met"
+    for worse in ({"missed": 0.021}, {"extra": 0.011}, {"off": 0.021}):
+        assert judge([part(), part(**{**fine, **worse})])["verdict"] == "not met"
+    # shares of events that were not seen are not judged
+    assert judge([part(**{**fine, "missed": 1.0, "true_events": 0.0})])["verdict"] == "met"
+    assert judge([part(**{**fine, "extra": 1.0, "found_events": 0.0})])["verdict"] == "met"
+    # 0.4 · 3 · 0.4/2.3 = 0.2087, of the worse part; at most 0.7 · 0.4
+    assert judge([part(off=0.03, p99=2.3), part(p99=1.9)])["quality_needed"] == pytest.approx(0.20)
+    assert judge([part(off=0.03, p99=1.3)])["quality_needed"] == pytest.approx(0.28)
+
+
 # ---- bounds -------------------------------------------------------------------------------------
 
 
@@ -211,6 +342,22 @@ def test_upper_and_lower_bounds_cover(share):
         low += lower_bound(values, 0.99) > 0.75 * share
     assert high <= 12 and low <= 12
     assert upper_bound(np.zeros(2000), 0.99) < 0.004 and lower_bound(np.ones(2000), 0.99) > 0.996
+
+
+@pytest.mark.parametrize(("draws", "confidence"), [(7, 0.9), (300, 0.99), (2_000_000, 0.995)])
+def test_the_bound_of_what_never_happened_is_where_the_capital_is_one_over_alpha(draws, confidence):
+    """Half of the capital at a stake of 0.99 and eight parts from 0.8 to 0.02: Σ p (1 + λ m)ⁿ = 1/α, to 0.1 %."""
+    stakes = np.array([0.99, *(0.8 * 40 ** (-np.arange(8) / 7))])
+    parts = np.array([0.5, *[1 / 16] * 8])
+    log_of = lambda m: logsumexp(draws * np.log1p(stakes * m), b=parts)  # noqa: E731
+    wanted = brentq(lambda m: log_of(m) + np.log(1 - confidence), 0, 5.0)
+    found = upper_bound(np.zeros(draws), confidence)
+    assert found == pytest.approx(min(wanted, 1.0), rel=1.1e-3)
+    assert lower_bound(np.ones(draws), confidence) == pytest.approx(1 - found)
+    # of a ratio one draw wins r · whole/most
+    whole = np.full(draws, 2.0)
+    assert ratio_upper_bound(0 * whole, whole, 3.0, confidence) == pytest.approx(min(1.5 * wanted, 1.0), rel=1.1e-3)
+    assert ratio_upper_bound(whole[:0], whole[:0], 3.0, confidence) == upper_bound(whole[:0], confidence) == 1.0
 
 
 def test_bounds_hold_whenever_one_stops():

@@ -73,6 +73,13 @@ def kernels():
     return np.stack([first, second])
 
 
+@pytest.mark.parametrize("fwhm_um", [2.2, 9.4])
+def test_a_gaussian_reaches_to_two_deviations(fwhm_um):
+    """In px of 5 µm; a full width at half of the most is √(8 ln 2) deviations."""
+    blur = GaussianBlur(rendering.mono(lens__psf_fwhm_um=fwhm_um))
+    assert blur.reach_px == pytest.approx(2 * fwhm_um / np.sqrt(8 * np.log(2)) / 5.0)
+
+
 def test_a_measured_psf_is_turned_about_the_axis_and_interpolated_over_the_height():
     told = {"type": "measured", "kernels": kernels().tolist(), "sample_um": 2.5, "image_height_mm": [0.0, 1.0]}
     sensor = rendering.mono(lens__psf=told)

@@ -4,10 +4,12 @@ import inspect
 import re
 from dataclasses import FrozenInstanceError, asdict, fields
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hesim_render.sources.render.change_driven import forecast
 from hesim_render.sources.render.change_driven.differences import Differences
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
 from hesim_render.sources.render.change_driven.pilot import Pilot, Refinement, allocate
@@ -191,3 +193,21 @@ def test_the_documented_constants_are_those_of_the_code():
     page = Path(__file__).parents[3] / "docs" / "change-driven-rendering.md"
     table = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page.read_text(encoding="utf-8"), re.MULTILINE)
     assert dict(table) == {name: str(value) for name, value in asdict(TUNING).items()}
+
+
+@pytest.mark.parametrize("share", [1, 9])
+def test_a_forecast_looks_at_twelve_squares_of_as_many_pixels_whatever_their_density(share):
+    """Sides of 12 px where all pixels count, and of 36 px where one in nine does, around pixels drawn at random."""
+    rows, cols = 90, 120
+    pixel = np.sort(np.random.default_rng(1).permutation(rows * cols)[: rows * cols // share]).astype(np.uint32)
+    source = SimpleNamespace(sensor=SimpleNamespace(rows=rows, cols=cols))
+    found = forecast._patches(pixel, source, np.random.default_rng(2))
+    reach = 6 * np.sqrt(share)
+    wanted = set()
+    for centre in np.random.default_rng(2).choice(pixel.size, 12):
+        at = divmod(int(pixel[centre]), cols)
+        for one in pixel.tolist():
+            place = divmod(one, cols)
+            if abs(place[0] - at[0]) <= reach and abs(place[1] - at[1]) <= reach:
+                wanted.add(one)
+    assert found.tolist() == sorted(wanted)

@@ -94,6 +94,23 @@ def test_fit_with_a_field_of_view_or_a_fixed_magnification():
     assert view.sensor.lens.focal_length_mm == 16
 
 
+@pytest.mark.parametrize("stated_m", [None, 0.7])
+def test_fit_with_a_field_of_view_focuses_on_the_target(stated_m):
+    """v from the field of view, d = v/m, and 1/f = 1/v + 1/d; or the distance that the file gives."""
+    sensor = mono(100, 50, lens__magnification="focus")
+    target = {"type": "flat", "width_m": 0.2, "height_m": 0.1}
+    camera = {"fit": "target", "horizontal_fov_deg": 30, "fit_margin": 0.8, "focus_distance_m": stated_m}
+    view = place_camera(make_scene(target=target, light=D65_1000_LUX, camera=camera).spec, sensor)
+    width_mm = 100 * sensor.spec.geometry.pitch_um * 1e-3
+    image_mm = width_mm / 2 / np.tan(np.radians(15))
+    away_mm = image_mm / (0.8 * width_mm / 200)
+    assert view.camera_to_world[2, 3] == pytest.approx(away_mm * 1e-3)
+    focus_mm = away_mm if stated_m is None else 700
+    lens = view.sensor.lens
+    assert lens.focal_length_mm == pytest.approx(1 / (1 / image_mm + 1 / focus_mm))
+    assert view.sensor.lens.image_distance_mm == pytest.approx(image_mm)
+
+
 def test_a_crop_off_the_axis_sees_its_part_of_the_full_picture():
     scene = hr.load_scene("siemens-star", {"camera": {"origin_m": [0, 0, 0.9], "target_m": [0, 0, 0]}})
     full = hr.load_sensor("reference-bayer")

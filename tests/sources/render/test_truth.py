@@ -8,8 +8,11 @@ from scipy.spatial.transform import Rotation
 
 import hesim_render as hr
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.truth import imu
 from hesim_render.sources.render.truth.imu import ImuModel
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
+from hesim_render.specs.motion import TrackSpec
 
 WHITE, BLACK = {"reflectance": {"flat": 1.0}}, {"reflectance": {"flat": 0.0}}
 #: A card that turns and moves sideways, a ball that flies in front of it, and a wall; the camera turns and moves.
@@ -447,6 +450,24 @@ def test_imu_of_a_turn_about_a_pivot_has_its_rate_its_centripetal_force_and_grav
     expected = [0, -9.80665, -(omega**2) * 0.5]  # at rest the specific force is up, −y of the unit
     # the mean over a sample is short by (ω dt)²/24 of it
     np.testing.assert_allclose(samples.accelerometer_ideal_m_per_s2, np.tile(expected, (400, 1)), rtol=2e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("repeat", [False, True])
+def test_velocity_of_a_track_that_begins_late_is_that_of_finite_differences(repeat):
+    """Three keyframes from 170 ms on, with shift, turn and pivot; one that repeats moves before and after as well."""
+    frames = [
+        {"t_us": 170_000, "translation_m": [0, 0, 0.1]},
+        {"t_us": 410_000, "translation_m": [0.2, -0.1, 0], "rotation_axis": [0, 1, 0.5], "rotation_deg": 70},
+        {"t_us": 900_000, "translation_m": [0.1, 0.3, 0.2], "rotation_axis": [0, 1, 0.5], "rotation_deg": 20},
+    ]
+    spec = {"object": "camera", "pivot_m": [0.1, 0, 2.5], "keyframes": frames, "repeat": repeat}
+    track, place = Trajectory(TrackSpec.model_validate(spec)), np.array([0.3, -0.2, 1.0])
+    times = np.array([40_000.0, 200_000, 390_000, 430_000, 880_000, 1_300_000])
+    found = imu._velocity(track, place, times)
+    before, after = (track.matrix(times + side) @ np.append(place, 1) for side in (-50.0, 50.0))
+    inside = repeat | ((times > 170_000) & (times < 900_000))
+    np.testing.assert_allclose(found, np.where(inside[:, None], (after - before)[:, :3] / 100e-6, 0), atol=1e-5)
+    assert np.abs(found[1:5]).min(axis=0).max() > 0.1
 
 
 def test_imu_samples_sum_up_to_the_motion_over_a_keyframe():

@@ -1,0 +1,224 @@
+"""Laws that calibrations of event pixels fit: by SciPy, slopes by finite differences, means by quadrature."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+from scipy.stats import norm
+
+from hesim_render.calibrate.asynchronous import fit as trials_fit
+from hesim_render.calibrate.evs import dispersion, thresholds
+from hesim_render.calibrate.evs.cells import Cells
+from hesim_render.calibrate.evs.model import log_probability
+
+#: θ₊, θ₋, s, κ.
+VALUES = np.array([0.21, 0.33, 0.05, 0.12])
+STEP = np.array([-0.7, -0.41, -0.3, -0.22, -0.05, 0.0, 0.07, 0.18, 0.26, 0.5])
+
+
+def slopes_of(function, at, step=1e-6):
+    return np.stack([(function(at + d) - function(at - d)) / (2 * step) for d in step * np.eye(at.size)], axis=-1)
+
+
+@pytest.mark.parametrize("polarity", [1.0, -1.0])
+def test_s_curves_and_their_slopes(polarity):
+    """P = Q((θ ∓ S)/s) with s = 0.05 (1 + κ S/θ̄), θ̄ the mean of both thresholds."""
+    theta = 0.21 if polarity > 0 else 0.33
+    width = 0.05 * (1 + 0.12 * STEP / 0.27)
+    np.testing.assert_allclose(thresholds.curve(VALUES, polarity, STEP), norm.sf((theta - polarity * STEP) / width))
+    found = thresholds.curve_slopes(VALUES, polarity, STEP)
+    # the width's own θ̄ is left out of the slope by θ, as the search does not need it
+    fixed = lambda values: norm.sf((values[0 if polarity > 0 else 1] - polarity * STEP) / width)  # noqa: E731
+    wanted = slopes_of(fixed, VALUES)[:, :2]
+    np.testing.assert_allclose(found[:, :2], wanted, atol=1e-7)
+    whole = slopes_of(lambda values: thresholds.curve(values, polarity, STEP), VALUES)
+    np.testing.assert_allclose(found[:, 2:], whole[:, 2:], atol=1e-7)
+    narrow = thresholds.curve(np.array([0.21, 0.33, 0.05, 3.0]), polarity, np.array([-2.0]))
+    np.testing.assert_allclose(narrow, norm.sf((theta + 2 * polarity) / (0.2 * 0.05)))
+
+
+def test_score_and_information_of_s_curves_are_those_of_binomial_counts():
+    """n = 700 trials: Σ n (rate − p)/(p q) ∂p, and Σ n ∂p ∂p/(p q)."""
+    rates = [np.linspace(0.05, 0.9, STEP.size), np.linspace(0.8, 0.1, STEP.size)]
+    score, fisher = thresholds._score(VALUES, rates, STEP, 700.0)
+    wanted, information = np.zeros(4), np.zeros((4, 4))
+    for rate, polarity in zip(rates, (1.0, -1.0), strict=True):
+        p = np.clip(thresholds.curve(VALUES, polarity, STEP), 1e-12, 1 - 1e-12)
+        slope = thresholds.curve_slopes(VALUES, polarity, STEP)
+        for k in range(STEP.size):
+            wanted += 700 * (rate[k] - p[k]) / (p[k] * (1 - p[k])) * slope[k]
+            information += 700 / (p[k] * (1 - p[k])) * np.outer(slope[k], slope[k])
+    np.testing.assert_allclose(score, wanted, rtol=1e-10)
+    np.testing.assert_allclose(fisher, information, rtol=1e-10)
+
+
+@pytest.mark.parametrize("m", [0.06, 0.15])
+def test_the_mismatch_explains_the_scatter_of_totals(m):
+    """Mean over normal thresholds of 40 trials a step: the variance of the total by quadrature gives m² back.
+
+    The width of a pixel's own curve is what is left of that of all: s² − m² θ².
+    """
+    theta, width, slope, trials = 0.21, 0.05, 0.12, 40
+    z, w = np.polynomial.hermite_e.hermegauss(60)
+    w = w / w.sum()
+    own = np.sqrt(width**2 - (m * theta) ** 2) * (1 + slope * STEP / theta)
+    p = norm.sf((theta * (1 + m * z)[:, None] - STEP) / own)
+    mean, within = trials * p.sum(axis=1), trials * (p * (1 - p)).sum(axis=1)
+    variance = w @ within + w @ mean**2 - (w @ mean) ** 2
+    found = thresholds._mismatch_square(theta, width, slope, STEP, variance, trials)
+    assert found == pytest.approx(m * m, rel=2e-3)
+    # less scatter than counting alone: below 0, by the slope of the total against the threshold
+    p = norm.sf((theta - STEP) / (width * (1 + slope * STEP / theta)))
+    ends = [trials * norm.sf((theta * f - STEP) / (width * (1 + slope * STEP / theta))).sum() for f in (0.999, 1.001)]
+    counting, by_theta = trials * (p * (1 - p)).sum(), (ends[1] - ends[0]) / 0.002
+    found = thresholds._mismatch_square(theta, width, slope, STEP, 0.7 * counting, trials)
+    assert found == pytest.approx(-0.3 * counting / by_theta**2, rel=1e-4)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_each_pixels_threshold_and_error_from_its_total(sign):
+    """The total that a threshold expects gives this threshold; its error is √(variance + ¼) over the slope."""
+    m, trials, signed = 0.1, 400, np.linspace(-0.1, 0.6, 15)
+    theta = VALUES[0 if sign > 0 else 1]
+    own = np.sqrt(0.05**2 - (m * theta) ** 2)
+    expect = lambda r: norm.sf((theta * r - signed) / (own * np.maximum(1 + 0.12 * sign * signed / theta, 0.2)))  # noqa: E731
+    for relative in (0.81, 1.0, 1.23):
+        p = expect(relative)
+        pixel, error = thresholds._of_pixel(VALUES, sign, signed, np.array([trials * p.sum()]), trials, m)
+        assert pixel[0] == pytest.approx(relative, abs=2e-4)
+        slope = trials * (expect(relative - 1e-3).sum() - expect(relative + 1e-3).sum()) / 2e-3
+        assert error[0] == pytest.approx(np.sqrt(trials * (p * (1 - p)).sum() + 0.25) / slope, rel=2e-3)
+
+
+def test_known_thresholds_are_drawn_towards_the_mean_by_their_noise():
+    """m²/(m² + n²) of the deviation is kept, and √(that · n²) is left unknown; ON and OFF have their own."""
+    on, off = np.array([[1.2, 0.7]]), np.array([[0.9, 1.3]])
+    given = SimpleNamespace(
+        pixel_on=on, pixel_off=off, noise_on=np.array([[0.05, 0.2]]), noise_off=np.array([[0.1, 0.03]]),
+        mismatch_on=0.1, mismatch_off=0.17,
+    )  # fmt: skip
+    found = thresholds.Thresholds.of_pixels(given)
+    for seen, spread, pixel, noise, m in (
+        (found.on, found.on_spread, on, given.noise_on, 0.1), (found.off, found.off_spread, off, given.noise_off, 0.17),
+    ):  # fmt: skip
+        trust = m**2 / (m**2 + noise**2)
+        np.testing.assert_allclose(seen, 1 + trust * (pixel - 1))
+        np.testing.assert_allclose(spread, np.sqrt(trust) * noise)
+
+
+@pytest.mark.parametrize(("law", "power"), [("sqrt", 0.5), ("linear", 1.0)])
+def test_probability_of_events_and_its_slopes(law, power):
+    """P = Q((1 ∓ ρ) r u/√(1 + m² u²)) (+ λ of ON), u = Θ (A I + B)/√(2 ((1 + e y)² + w y²)), y = √I or I."""
+    signal = np.array([3.0, 3.0, 40.0, 40.0, 900.0, 900.0])
+    polarity = np.array([1.0, -1, 1, -1, 1, -1])
+    relative, spread = np.array([1.0, 0.9, 1.1, 1.05, 0.97, 1.2]), np.array([0.1, 0.12, 0.05, 0.2, 0.15, 0.08])
+    cells = Cells(signal, polarity, relative, spread, np.ones(6), np.zeros(6), 1)
+    at = np.array([0.004, np.log(0.9), 0.0021 if law == "sqrt" else 2e-5, 0.013 if law == "sqrt" else 9e-4, 0.06, 3e-3])
+    theta_v = 2.3
+
+    def expected(parameters):
+        a, log_b, w, e, rho, leak = parameters
+        y = signal**power
+        u = theta_v * (a * signal + np.exp(log_b)) / np.sqrt(2 * ((1 + e * y) ** 2 + w * y**2))
+        p = norm.sf((1 - polarity * rho) * relative * u / np.sqrt(1 + (spread * u) ** 2))
+        return np.log(p + np.where(polarity > 0, leak, 0.0))
+
+    found, slopes = log_probability(at, cells, theta_v, law)
+    np.testing.assert_allclose(found, expected(at), rtol=1e-9)
+    wanted = np.stack(
+        [(expected(at + d) - expected(at - d)) / (2 * d.max()) for d in 1e-5 * np.diag(np.abs(at))], axis=-1
+    )
+    np.testing.assert_allclose(slopes, wanted, rtol=2e-4, atol=1e-7)
+
+
+def test_likelihood_of_counts_is_the_mean_over_normal_thresholds():
+    """Counts of 200 trials of pixels with u (1 + m z): against a sum over 40,001 thresholds, up to one constant."""
+    u, events = np.array([0.4, 0.9, 1.6, 2.2]), np.array([90.0, 31.0, 16.0, 1.0])
+    scale, m = np.array([1.1, 0.93]), 0.17
+    group = np.array([0, 0, 1, 1])
+    mixture = dispersion._Mixture(u, events, group, np.arange(4), 200)
+    z = np.linspace(-10, 10, 40_001)
+    middle = (u * scale[group])[:, None]
+    log_q, log_rest = norm.logsf(middle * (1 + m * z)), norm.logcdf(middle * (1 + m * z))
+    terms = events[:, None] * log_q + (200 - events[:, None]) * log_rest - z * z / 2
+    top = terms.max(axis=1)
+    wanted = top + np.log(np.exp(terms - top[:, None]).sum(axis=1) * (z[1] - z[0])) - 0.5 * np.log(2)
+    np.testing.assert_allclose(mixture.log_likelihood(m, scale), wanted, atol=2e-5)
+
+
+def test_dispersion_weighs_counts_by_what_their_variance_is_known_with():
+    """Weights 1/(2 + 1/c) of the squares over counting, less thresholds; the error is that of the weighted mean."""
+    rng = np.random.default_rng(1)
+    counting, between = rng.uniform(0.3, 9, 400), rng.uniform(0, 0.2, 400)
+    residual = np.sqrt(1.4 * counting + between) * rng.standard_normal(400)
+    weight = 1 / (2 + 1 / counting)
+    values = (residual**2 - between) / counting
+    mean = np.average(values, weights=weight)
+    error = np.sqrt(np.sum(weight**2 * (values - mean) ** 2)) / weight.sum()
+    assert dispersion._ratio(residual, counting, between) == pytest.approx((mean, error))
+    assert dispersion._ratio(0 * residual, counting, between)[0] == 0
+    assert np.isnan(dispersion._ratio(residual[:99], counting[:99], between[:99])).all()
+    assert np.isfinite(dispersion._ratio(residual[:100], counting[:100], between[:100])).all()
+
+
+def curves_of(theta, response, lights):
+    """Centres |ln I₁/I₀| at which a threshold θ is met: (1 + r I e^{±c})/(1 + r I) = e^{±θ}."""
+    result = []
+    for polarity, one in zip((1, -1), theta, strict=True):
+        for light in lights:
+            ratio = (np.exp(polarity * one) * (1 + response * light) - 1) / (response * light)
+            result.append((polarity, light, polarity * np.log(ratio), 1e-3))
+    return result
+
+
+def test_lights_agree_on_the_threshold_at_the_true_response():
+    """Relative variances of θ over three lights, of ON and of OFF; 0 at the response that the centres are of."""
+    lights = np.array([20.0, 60.0, 300.0])
+    curves = curves_of((0.2, 0.31), 0.03, lights)
+    assert trials_fit._disagreement(curves, 0.03) == pytest.approx(0, abs=1e-20)
+    wanted = 0.0
+    for polarity in (1, -1):
+        centre = np.array([c for p, _, c, _ in curves if p == polarity])
+        theta = np.abs(np.log1p(0.1 * lights * np.exp(polarity * centre)) - np.log1p(0.1 * lights))
+        wanted += theta.var() / theta.mean() ** 2
+    assert wanted > 1e-3 and trials_fit._disagreement(curves, 0.1) == pytest.approx(wanted)
+    assert trials_fit._disagreement([curves[0], curves[-1]], 0.1) == 0  # one light of each tells nothing
+
+
+def test_pooled_s_curves_have_the_moments_of_their_law():
+    """Steps of both signs in any order, 3 pixels, 10,000 trials of a normal law: its mean, and its variance."""
+    rng = np.random.default_rng(5)
+    size = np.arange(0.02, 0.62, 0.02)
+    contrast = np.concatenate([size, -size])[rng.permutation(2 * size.size)]
+    light = np.where(np.arange(contrast.size) < 0, 0.0, 70.0)
+    centre, width = {1: 0.27, -1: 0.36}, {1: 0.05, -1: 0.07}
+    sign = np.sign(contrast).astype(int)
+    chance = np.array([ndtr((abs(c) - centre[s]) / width[s]) for c, s in zip(contrast, sign, strict=True)])
+    calm = np.full((contrast.size, 3), 10_000)
+    first = np.rint(calm * chance[:, None])  # in the first bin; a second one has what comes later
+    events = {s: np.stack([np.where((sign == s)[:, None], first, 0), 77 + 0 * first], axis=1) for s in (1, -1)}
+    steps = SimpleNamespace(signal_dn=light, contrast=contrast, calm=calm, events=lambda polarity: events[polarity])
+    for s in (1, -1):
+        ((polarity, at, mean, variance),) = trials_fit._pooled_curves(steps, s)
+        assert (polarity, at) == (s, 70.0)
+        assert mean == pytest.approx(centre[s], abs=2e-3)
+        assert variance == pytest.approx(width[s] ** 2, rel=0.08)
+    few = SimpleNamespace(**{**vars(steps), "calm": calm * 2})  # a rate that ends at a half is none
+    assert trials_fit._pooled_curves(few, 1) == []
+    # each pixel's own, from the events of all bins
+    both = {s: np.stack([part * first * (sign == s)[:, None] for part in (0.6, 0.4)], axis=1) for s in (1, -1)}
+    steps = SimpleNamespace(**{**vars(steps), "events": lambda polarity: both[polarity]})
+    for s in (1, -1):
+        np.testing.assert_allclose(trials_fit.pixel_thresholds(steps, s), centre[s], atol=2e-3)
+
+
+def test_middle_spread_and_leak_of_a_start():
+    """Quartiles of a normal law are 1.349 deviations apart; half an event is added to those of the brightest light."""
+    values = 3.0 + 0.4 * norm.ppf((np.arange(4001) + 0.5) / 4001)
+    assert trials_fit.middle_and_spread(values) == pytest.approx((3.0, 0.4 / 3.0), rel=1e-3)
+    steady = SimpleNamespace(
+        signal_dn=np.array([3.0, 90.0, 20.0]), on=np.array([[[5, 1]], [[7, 4]], [[9, 9]]]),
+        calm=np.array([[10, 10], [30, 50], [90, 90]]), edges_s=np.array([0.0, 0.1, 0.25]),
+    )  # fmt: skip
+    assert trials_fit._leak_start(steady) == pytest.approx(11.5 / (80 * 0.25))

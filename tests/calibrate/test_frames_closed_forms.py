@@ -1,0 +1,263 @@
+"""Steps of the calibration of frames: dark lines, clipping, composite, telegraph noise, checks; by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+from scipy.stats import chi2, norm
+
+from hesim_render.calibrate.aps import checks, composite, dark, sensor_file, telegraph
+from hesim_render.calibrate.finding import ALARM
+
+
+def test_lines_of_pixels_that_lack_exposures_are_those_of_polyfit():
+    rng = np.random.default_rng(1)
+    t, weight = np.array([0.01, 0.05, 0.2, 0.4]), np.array([3.0, 2.0, 1.5, 0.4])
+    mean = rng.uniform(20, 60, (4, 5)).astype(np.float32)
+    valid = np.array([[1, 1, 1, 1], [0, 1, 1, 1], [1, 0, 1, 1], [1, 1, 0, 0], [0, 1, 0, 1]], bool).T
+    value, slope = dark._masked(mean, t, weight, valid)
+    for k in range(5):
+        some = valid[:, k]
+        wanted = np.polyfit(t[some], mean[some, k], 1, w=np.sqrt(weight[some]))
+        np.testing.assert_allclose((slope[k], value[k]), wanted, rtol=1e-4)
+    n_fp, n_dp, covariance = dark._all_pixels(mean[:, None], t, weight)
+    for k in range(5):
+        line, plain = np.polyfit(t, mean[:, k], 1, w=np.sqrt(weight), cov="unscaled")
+        np.testing.assert_allclose((n_dp[0, k], n_fp[0, k]), line, rtol=1e-5)
+    np.testing.assert_allclose(covariance[::-1, ::-1], plain)
+    model = dark.DarkModel(None, 0.0, None, None, covariance, None, None, None, 0.0)
+    assert model.mean_variance(0.3) == pytest.approx(plain[1, 1] + 2 * 0.3 * plain[0, 1] + 0.09 * plain[0, 0])
+
+
+def test_the_fixed_pattern_is_black_rows_and_what_is_left():
+    """Means of good pixels alone; a row without any has no offset, and a pixel that is not good none of its own."""
+    n_fp = np.array([[40.0, 44, 300], [50, 52, 54], [7, 8, 9]])
+    good = np.array([[1, 1, 0], [1, 1, 1], [0, 0, 0]], bool)
+    black, row, own = dark.split_fixed_pattern(n_fp, good)
+    assert black == pytest.approx((42 + 52) / 2)
+    np.testing.assert_allclose(row, [-5, 5, 0])
+    np.testing.assert_allclose(own, [[-2, 2, 0], [-2, 0, 2], [0, 0, 0]])
+
+
+def moments_of(**given):
+    exposures = np.array(given["exposures_s"])
+    return SimpleNamespace(exposures_us=(1e6 * exposures).round().astype(int), **given)
+
+
+def test_hot_pixels_lie_six_robust_deviations_above_the_middle():
+    """1.4826 times the median deviation of normal dark currents is their spread; the line is weighted by its noise."""
+    rng, t = np.random.default_rng(3), np.array([0.02, 0.1, 0.3])
+    current = 30 + 4 * norm.ppf((rng.permutation(40 * 50) + 0.5) / 2000).reshape(40, 50)
+    current[[3, 20], [5, 7]] = 30 + 4 * 6.15, 30 + 4 * 5.85
+    mean = (50 + current * t[:, None, None]).astype(np.float32)
+    moments = moments_of(
+        exposures_s=t, mean=mean, variance=np.full(mean.shape, 3.0, np.float32), frames=4000,
+        lowest=np.full(mean.shape, 9), highest=np.full(mean.shape, 90),
+    )  # fmt: skip
+    found = dark.fit_dark(moments, np.ones((40, 50), bool), 1023)
+    assert found.hot_limit_dn_per_s == pytest.approx(30 + 24, abs=0.2)
+    assert np.argwhere(found.hot).tolist() == [[3, 5]] and not found.bad.any()
+    assert found.chi2_per_dof == pytest.approx(0, abs=1e-4) and found.black == pytest.approx(50, abs=1e-3)
+
+
+def lit(signal, t, variance, frames=9, **more):
+    signal = np.asarray(signal, np.float32)
+    given = {
+        "exposures_s": np.asarray(t), "mean": signal + 50, "variance": np.broadcast_to(variance, signal.shape),
+        "frames": frames, "highest": signal + 60, "lowest": signal + 40,
+    }  # fmt: skip
+    return moments_of(**{**given, **more})
+
+
+def test_full_well_shows_as_pixels_at_one_level_that_shorter_exposures_predict_beyond():
+    """25 of 400 pixels stop at 300 DN where 1.15 · 300 is predicted and more; a level below full scale."""
+    rate = np.full((20, 20), 1000.0)
+    rate.ravel()[:25] = 3600.0
+    t = np.array([0.05, 0.1, 0.2])
+    signal = np.minimum(rate * t[:, None, None], 300.0)
+    good = np.ones((20, 20), bool)
+    moments = lit(signal, t, 0.5)
+    assert composite.saturation_dn(moments, signal, good, 1023) == pytest.approx(300)
+    assert composite.saturation_dn(moments, signal, good, 355) is None  # the ADC clips them
+    # predicted are 600 DN, with six deviations 2 √(V/9): less than 1.15 · 300 from V = 4064 DN² on
+    assert composite.saturation_dn(lit(signal, t, 4000.0), signal, good, 1023) == pytest.approx(300)
+    assert composite.saturation_dn(lit(signal, t, 4130.0), signal, good, 1023) is None
+    good.ravel()[:6] = False
+    assert composite.saturation_dn(moments, signal, good, 1023) is None  # 19 are too few
+    other = signal.copy()
+    other[1:].reshape(2, -1)[:, :25] *= np.linspace(0.6, 1.0, 25)  # of no common level
+    assert composite.saturation_dn(lit(other, t, 0.5), other, np.ones((20, 20), bool), 1023) is None
+
+
+def test_pixels_are_clear_of_both_ends_and_of_the_full_well_by_six_deviations():
+    beta = np.array([[[9.0, 0.5, 0.0, 0.0, 0.0, 0.0]]])
+    row_variance, signal = 2.0, np.array([[0.0, 100.0, 400.0, 900.0]])
+    margin = 6 * np.sqrt(9 + 0.5 * signal + 1 / 12 + row_variance)
+    moments = lit(signal[None], [0.1], 1.0)
+    for low in (-1e-3, 1e-3):  # the mean just inside, or just outside of either end
+        shifted = SimpleNamespace(**{**vars(moments), "mean": (margin + low)[None]})
+        assert np.all(composite.clear_of_clipping(shifted, signal, 0, beta, 2000, None, row_variance) == (low > 0))
+        shifted = SimpleNamespace(**{**vars(moments), "mean": (2000 - margin + low)[None]})
+        assert np.all(composite.clear_of_clipping(shifted, signal, 0, beta, 2000, None, row_variance) == (low < 0))
+    inside = SimpleNamespace(**{**vars(moments), "mean": np.full((1, 1, 4), 1000.0)})
+    well = 400 + margin[0, 2]
+    for low in (-1e-3, 1e-3):
+        found = composite.clear_of_clipping(inside, signal, 0, beta, 2000, well + low, row_variance)
+        assert found.tolist() == [[True, True, low > 0, False]]
+    # without a polynomial by the pixels' own extremes
+    ends = SimpleNamespace(
+        **{**vars(moments), "highest": np.array([[[1999, 2000, 9, 9]]]), "lowest": np.array([[[1, 5, 0, 9]]])}
+    )
+    assert composite.clear_of_clipping(ends, signal, 0, None, 2000, None).tolist() == [[True, False, False, True]]
+    at = signal[0, 1] + 6 * np.sqrt(1.0)
+    assert composite.clear_of_clipping(ends, signal, 0, None, 2000, at)[0].tolist() == [True, False, False, False]
+
+
+def test_the_composite_weighs_exposures_by_their_noise():
+    """Rate of a line through the origin with weights 1/(V/n + dark); its error is 1/√(Σ w t²)."""
+    t = np.array([0.02, 0.1])
+    beta = np.array([[[4.0, 0.3, 11.0, 1e-4, 0.2, 3.0]]])
+    signal = np.array([[[10.0, 14.0, 90.0]], [[55.0, 66.0, 400.0]]])
+    usable = np.array([[[1, 1, 0]], [[1, 0, 0]]], bool)
+    model = SimpleNamespace(
+        n_fp=np.full((1, 3), 50.0, np.float32), n_dp=np.full((1, 3), 20.0, np.float32),
+        mean_variance=lambda s: 0.1 + 2 * s,
+    )  # fmt: skip
+    moments = SimpleNamespace(mean=(signal + 50 + 20 * t[:, None, None]).astype(np.float32), exposures_s=t, frames=7)
+    found = composite.compose(moments, model, usable, beta)
+    x = signal[:, 0]
+    s = t[:, None]
+    terms = np.stack([np.ones_like(x), x, s + 0 * x, x**2, x * s, s**2 + 0 * x])
+    variance = np.tensordot(beta[0, 0], terms, 1)
+    weight = usable[:, 0] / ((variance + 1 / 12) / 7 + 0.1 + 2 * s)
+    rate = np.sum(weight * x * s, axis=0)[:2] / np.sum(weight * s**2, axis=0)[:2]
+    np.testing.assert_allclose(found.rate_dn_per_s[0, :2], rate, rtol=1e-5)
+    error = 1 / np.sqrt(np.sum(weight * s**2, axis=0)[:2])
+    np.testing.assert_allclose(found.standard_error_dn_per_s[0, :2], error, rtol=1e-5)
+    assert np.isnan(found.rate_dn_per_s[0, 2]) and np.isnan(found.standard_error_dn_per_s[0, 2])
+
+
+def test_the_chain_has_the_likelihood_of_all_paths():
+    """A chain of two states over 4 frames, twice: the sum over its 16 paths gives likelihood and states."""
+    rng = np.random.default_rng(5)
+    y, t = rng.normal(50, 4, (2, 4, 3)), np.array([0.3, 1.0])[:, None, None]
+    level, width = np.array([[48.0, 50, 46], [2.0, 1.0, 0.0], [6.0, 3.0, 9.0]]), np.array([2.0, 3.0, 1.5])
+    share, stay = np.array([0.3, 0.6, 0.2]), np.array([0.7, 0.2, 0.5])
+    found, high, both = telegraph._chain(y, t, level, width, share, stay)
+    for pixel in range(3):
+        p = np.array([1 - share[pixel], share[pixel]])
+        move = stay[pixel] * np.eye(2) + (1 - stay[pixel]) * p
+        total, states, pairs = 0.0, np.zeros((2, 4)), 0.0
+        for k in range(2):
+            mean = level[0, pixel] + level[1, pixel] * t[k, 0, 0] + np.array([0, level[2, pixel]])
+            density = norm.pdf(y[k, :, pixel, None], mean, width[pixel])
+            paths = np.array(np.unravel_index(np.arange(16), (2, 2, 2, 2))).T
+            chance = np.array([
+                p[path[0]] * np.prod(move[path[:-1], path[1:]]) * np.prod(density[range(4), path]) for path in paths
+            ])  # fmt: skip
+            total += np.log(chance.sum())
+            chance /= chance.sum()
+            states[k] = chance @ paths
+            pairs += chance @ (paths[:, :-1] * paths[:, 1:]).sum(axis=1)
+        assert found[pixel] == pytest.approx(total)
+        np.testing.assert_allclose(high[:, :, pixel], states)
+        assert both[pixel] == pytest.approx(pairs / (2 * 3))
+
+
+def test_two_levels_are_fitted_with_their_share_and_correlation():
+    """30 pixels of 12 DN distance, a fifth of the time high, correlation 0.6; upside down it is four fifths."""
+    rng, frames = np.random.default_rng(6), 200
+    state = np.zeros((2, frames, 30), bool)
+    state[:, 0] = rng.random((2, 30)) < 0.2
+    for k in range(1, frames):
+        state[:, k] = np.where(rng.random((2, 30)) < 0.6, state[:, k - 1], rng.random((2, 30)) < 0.2)
+    t = np.array([0.1, 0.4])
+    y = 60 + 25 * t[:, None, None] + 12.0 * state + 2.5 * rng.standard_normal(state.shape)
+    found = telegraph.fit_two_levels(y, t)
+    assert found.is_telegraph.all()
+    seen = state.mean(axis=(0, 1))
+    np.testing.assert_allclose(found.amplitude_dn, 12, atol=1.2)
+    np.testing.assert_allclose(found.width_dn, 2.5, rtol=0.15)
+    np.testing.assert_allclose(found.high_share, seen, atol=0.02)
+    np.testing.assert_allclose(found.visits, 400 * seen, atol=10)
+    assert found.correlation.mean() == pytest.approx(0.6, abs=0.04)
+    turned = telegraph.fit_two_levels(200 - y, t)
+    np.testing.assert_allclose(turned.high_share, 1 - found.high_share, atol=0.01)
+    # the gain: the likelihood of one level of any width, with as many values
+    rest = y - y.mean(axis=1, keepdims=True)
+    one = -0.5 * 400 * (np.log(2 * np.pi * np.mean(rest**2, axis=(0, 1))) + 1)
+    two = norm.logpdf(y - 60 - 25 * t[:, None, None] - 12 * state, scale=2.5).sum(axis=(0, 1))
+    np.testing.assert_allclose(found.gain / (two - one), 1, atol=0.55)
+
+
+def test_suspects_have_a_chance_of_1e_6_beside_pixels_with_as_much_dark_current():
+    """Variance 4 DN² and 0.2 DN² for each DN of dark current; two pixels just above, and just below the limit."""
+    t, frames = np.array([0.1, 0.5]), 21
+    current = np.tile(np.linspace(10, 100, 80), (80, 1))
+    signal = (current * t[:, None, None]).astype(np.float32)
+    variance = 4 + 0.2 * (current * t[:, None, None])
+    limit = chi2.isf(1e-6, 2 * (frames - 1)) / (2 * (frames - 1))
+    for factor, place in ((1.01, (7, 60)), (0.99, (8, 20)), (1.01, (40, 79)), (0.99, (41, 0))):
+        variance[:, place[0], place[1]] *= factor * limit
+    clear = np.full(signal.shape, 30)
+    moments = moments_of(
+        exposures_s=t,
+        mean=50 + signal,
+        variance=variance.astype(np.float32),
+        frames=frames,
+        lowest=clear,
+        highest=clear,
+    )
+    used = np.ones((80, 80), bool)
+    found = telegraph._suspects(moments, used, (1, 1), 1023)
+    assert np.argwhere(found).tolist() == [[7, 60], [40, 79]]
+    used[7, 60] = False
+    assert np.argwhere(telegraph._suspects(moments, used, (2, 1), 1023)).tolist() == [[40, 79]]
+
+
+def test_the_largest_of_several_deviations_is_told_with_its_chance():
+    """Twice the tail of a normal law, times the number of values; both significance and size are asked for."""
+    values = [(0.02, 0.001, 5000), (-0.05, 0.008, 20_000), (0.5, 0.2, 40_000)]
+    found = checks._largest(values, 0.01, "name", "{:+.3g} at {:g} ms", 100.0)
+    assert found.check == "name" and found.text == "-5 at 20 ms"
+    assert found.p_value == pytest.approx(2 * norm.sf(0.05 / 0.008) * 3)
+    assert checks._largest(values, 0.06, "name", "", 1.0) is None
+    shared = lambda variance, p, ratio: SimpleNamespace(variance=variance, p_value=p, ratio=ratio)  # noqa: E731
+    drifts = [("a", shared(0.2, 1e-7, 5.0)), ("b", shared(0.1, 1e-9, 8.0)), ("c", shared(0.3, 0.9 * ALARM, 9.0))]
+    assert checks._worst(drifts, 0.05) == ("b", pytest.approx(3e-9))
+    assert checks._worst(drifts, 0.1) == ("a", pytest.approx(3e-7)) and checks._worst(drifts, 0.2) is None
+    assert checks._worst(drifts[2:], 0.1) == ("c", pytest.approx(0.9 * ALARM))
+
+
+@pytest.mark.parametrize(("seen", "limit"), [(0.01, "captures"), (0.011, "ADC")])
+def test_the_sensor_file_of_captures_has_their_figures(tmp_path, seen, limit):
+    """Full well is the largest signal, or 1.25 of full scale where the ADC limits it; exposures take half the time."""
+    pairs = SimpleNamespace(
+        spec=SimpleNamespace(full_scale_dn=1023, bit_depth=10), shape=(14, 22), has_photons=True,
+        spatial_lit=SimpleNamespace(exposure_s=0.0304),
+    )  # fmt: skip
+    result = SimpleNamespace(
+        gain=SimpleNamespace(slope=0.4), pairs=pairs, saturation=1, signal=np.array([100.0, 800.0]), top_dn=800.0,
+        lit=SimpleNamespace(high=np.array([0.9, seen])), responsivity=SimpleNamespace(slope=0.23),
+        black=SimpleNamespace(value=61.5, slope=17.0), noise=SimpleNamespace(value=8.9),
+    )  # fmt: skip
+    (tmp_path / "there").mkdir()
+    file = sensor_file.write_sensor(tmp_path / "s.yaml", tmp_path / "there" / "c.yaml", result)
+    data = yaml.safe_load(file.read_text(encoding="utf-8"))
+    assert data["noise"] == "there/c.yaml" and data["name"] == "s" and data["geometry"]["rows"] == 14
+    assert data["geometry"]["cols"] == 22 and data["quantum_efficiency"] == pytest.approx(0.23 / 0.4)
+    aps = data["aps"]
+    assert aps["full_well_e"] == pytest.approx(800 / 0.4 if limit == "captures" else 1.25 * 1023 / 0.4, rel=1e-5)
+    assert limit in data["assumptions"]["aps.full_well_e"]
+    assert aps["read_noise_e"] == pytest.approx(np.sqrt(8.9 - 1 / 12) / 0.4, rel=1e-5)
+    assert aps["dark_current_e_per_s"] == pytest.approx(17 / 0.4) and aps["black_level_dn"] == 61.5
+    assert aps["exposure_us"] == 30_400 and aps["frame_rate_hz"] == pytest.approx(0.5 / 0.0304, rel=1e-5)
+    assert aps["bit_depth"] == 10 and aps["system_gain_dn_per_e"] == pytest.approx(0.4)
+    pairs.has_photons, pairs.spatial_lit.exposure_s, result.black.slope = False, 1e-3, -2.0
+    data = yaml.safe_load(sensor_file.write_sensor(file, tmp_path / "c.yaml", result).read_text(encoding="utf-8"))
+    assert data["quantum_efficiency"] == 0.5 and data["noise"] == "c.yaml"
+    assert data["aps"]["frame_rate_hz"] == 30 and data["aps"]["dark_current_e_per_s"] == 0
+    result.saturation = 2  # never seen
+    data = yaml.safe_load(sensor_file.write_sensor(file, tmp_path / "c.yaml", result).read_text(encoding="utf-8"))
+    assert data["aps"]["full_well_e"] == pytest.approx(1.25 * 1023 / 0.4, rel=1e-5)

@@ -1,0 +1,227 @@
+"""Values and errors that calibrations write, each from numbers given by hand: sums of squares, quotients, densities."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from hesim_render.calibrate.aps import output as frames_output
+from hesim_render.calibrate.aps import pairs_output
+from hesim_render.calibrate.aps.common_mode import Shared
+from hesim_render.calibrate.aps.pairs_findings import findings
+from hesim_render.calibrate.aps.spatial import SpatialVariance
+from hesim_render.calibrate.asynchronous import output as trials_output
+
+#: Half of an interval of 95 % of a normal law, errors.
+Z = 1.959964
+#: Gain, DN/e⁻, and its relative error.
+K, RELATIVE = 0.37, 0.021
+
+
+def calibration(**changed):
+    """A calibration of EMVA 1288 captures with unlike numbers everywhere."""
+    spatial_dark = SpatialVariance(0.31, 0.12, 1.7, (0.011, 0.017, 0.13), (13, 21, 273))
+    spatial_lit = SpatialVariance(0.9, 2.4, 6.1, (0.05, 0.07, 0.9), (13, 21, 273))
+    mean = np.full((14, 22), 40.0)
+    given = {
+        "pairs": SimpleNamespace(has_photons=True, shape=(14, 22)),
+        "gain": SimpleNamespace(slope=K, error=K * RELATIVE, groups=9),
+        "responsivity": SimpleNamespace(slope=0.22, error=0.0031, groups=9),
+        "noise": SimpleNamespace(value=8.9, error=0.23, slope=61.0, groups=7),
+        "black": SimpleNamespace(value=40.0, slope=17.0, slope_error=0.7, groups=5, rms=0.002),
+        "lines_dn2": 0.7, "row": (0.62, 0.05), "col": (0.04, 0.03),
+        "light": np.array([100.0, 300.0, 900.0, 1500.0]), "saturation": 2, "signal": np.array([22.0, 66, 190, 200]),
+        "clear": np.array([1, 1, 0, 0], bool), "lit": SimpleNamespace(high=np.array([0.0, 0.0, 0.004, 0.2])),
+        "long_dark": SimpleNamespace(spatial=spatial_dark, mean=mean),
+        "long_lit": SimpleNamespace(spatial=spatial_lit, mean=mean + 120),
+        "linearity": (np.array([1, 0, 1, 1], bool), np.array([-0.4, 0.1, 0.9])),
+        "curve": SimpleNamespace(at=lambda x: 0.22 * (x + 2) * 1.0021, terms=np.array([0.22, 0, 0]), offset=2.0,
+                                 offset_error=0.51, bends=True, light_rms=4e-4),
+        "level_rms": 0.0019, "level_chance": 1e-9, "level_chi2": 3.2,
+        "noise_spectrum": SimpleNamespace(lines=[], correlated=False, correlation=-0.013, correlation_error=0.02),
+    }  # fmt: skip
+    return SimpleNamespace(**{**given, **changed})
+
+
+def check(entry, value, error, unit, half=None):
+    assert entry["value"] == pytest.approx(value) and entry["standard_error"] == pytest.approx(error)
+    assert entry["unit"] == unit
+    if half is not None:
+        assert entry["interval_95"] == pytest.approx([value - half * error, value + half * error], rel=1e-5)
+
+
+def test_noise_of_emva_captures_in_electrons_with_its_error():
+    """Read noise is the dark variance less interference and 1/12; the standard's has rows and columns besides."""
+    variance = 8.9 - 0.7 - 1 / 12
+    noise = np.sqrt(variance) / K
+    found = pairs_output._read_noise(calibration(), K, RELATIVE)
+    check(found, noise, noise * np.hypot(0.23 / (2 * variance), RELATIVE), "e-", 2.446912)  # Student's, 6 degrees
+    assert found["value_dn"] == pytest.approx(np.sqrt(variance))
+    variance = 8.9 - 1 / 12 + 0.62 + 0.04
+    noise = np.sqrt(variance) / K
+    error = np.sqrt(0.23**2 + 0.05**2 + 0.03**2) / (2 * variance)
+    check(pairs_output._dark_noise(calibration(), K, RELATIVE), noise, noise * np.hypot(error, RELATIVE), "e-", Z)
+    less = pairs_output._dark_noise(calibration(row=(-0.3, 0.05), col=(-0.2, 0.03)), K, RELATIVE)
+    assert less["value"] == pytest.approx(np.sqrt(8.9 - 1 / 12) / K)
+
+
+def test_efficiency_dark_current_and_full_well_of_emva_captures():
+    value = 0.22 / K
+    found = pairs_output._quantum_efficiency(calibration(), RELATIVE)
+    check(found, value, value * np.hypot(RELATIVE, 0.0031 / 0.22), "e-/photon", 2.306004)  # 8 degrees
+    found = pairs_output._dark_current(calibration(), K, RELATIVE)
+    check(found, 17 / K, np.hypot(0.7 / K, 17 / K * RELATIVE), "e-/s", 2.776445)  # 4 degrees
+    assert found["from_variance"] == pytest.approx(61 / K**2) and found["value_dn_per_s"] == 17
+    # half of the distance of the levels around is a rectangular law's width: divided by √3
+    found = pairs_output._full_well(calibration(), K, RELATIVE)
+    electrons = 0.22 * 900 / K
+    check(found, electrons, electrons * np.hypot(RELATIVE, (1500 - 300) / 2 / np.sqrt(3) / 900), "e-", Z)
+    assert found["limited_by"] == "ADC full scale" and found["photons"] == 900
+    high = SimpleNamespace(high=np.array([0.5, 0.5, 0.01, 0.009]))
+    assert pairs_output._full_well(calibration(lit=high), K, RELATIVE)["limited_by"] == "full well"
+    last = pairs_output._full_well(calibration(saturation=3), K, RELATIVE)
+    assert last["standard_error"] / last["value"] == pytest.approx(
+        np.hypot(RELATIVE, (1500 - 900) / 2 / np.sqrt(3) / 1500)
+    )
+    none = pairs_output._full_well(calibration(saturation=4), K, RELATIVE)
+    assert none["value"] is None and f"at least {200 / K:.0f} e-" in none["reason"]
+
+
+def test_spread_over_pixels_of_emva_captures():
+    """In the dark, and in the light less that of the dark; errors are those of a device drawn from its law."""
+    errors = [calibration().long_dark.spatial.errors(fixed=False), calibration().long_lit.spatial.errors(fixed=False)]
+    total = 0.31 + 0.12 + 1.7
+    found = pairs_output._dsnu(calibration(), K, RELATIVE)
+    relative = errors[0][3] / (2 * total)
+    check(found, np.sqrt(total) / K, np.sqrt(total) / K * np.hypot(relative, RELATIVE), "e-", Z)
+    parts = [found[f"{name}_e"] for name in ("row", "column", "pixel")]
+    assert parts == pytest.approx(np.sqrt([0.31, 0.12, 1.7]) / K)
+    faint = SpatialVariance(-0.02, 0.001, 0.1, (0.1, 0.2, 0.9), (13, 21, 273))
+    found = pairs_output._dsnu(calibration(long_dark=SimpleNamespace(spatial=faint)), K, RELATIVE)
+    limit = np.sqrt(0.081 + Z * faint.errors(fixed=False)[3]) / K
+    assert found["value"] == 0 and found["upper_limit"] == pytest.approx(limit, rel=1e-5) and found["row_e"] == 0
+    found = pairs_output._prnu(calibration())
+    variance = 0.9 + 2.4 + 6.1 - total
+    error = np.hypot(errors[0][3], errors[1][3]) / (2 * np.sqrt(variance))
+    check(found, 100 * np.sqrt(variance) / 120, 100 * error / 120, "%", Z)
+    parts = [found[f"{name}_percent"] for name in ("row", "column", "pixel")]
+    assert parts == pytest.approx(100 * np.sqrt([0.59, 2.28, 4.4]) / 120)
+
+
+def test_errors_of_spatial_variances_have_what_pixels_add_to_rows_and_columns():
+    """Of a given device 4 v n + 2 n², of its law 2 (v + n)², per degree of freedom; a row has v of its pixels/cols."""
+    spatial = SpatialVariance(0.31, -0.12, 1.7, (0.011, 0.017, 0.13), (13, 21, 273))
+    v = np.array([0.31 + 1.7 / 22, 0.0 + 1.7 / 14, 1.7])
+    n, freedom = np.array([0.011, 0.017, 0.13]), np.array([13, 21, 273])
+    for fixed, scatter in ((True, 4 * v * n + 2 * n**2), (False, 2 * (v + n) ** 2)):
+        each = np.sqrt(scatter / freedom)
+        np.testing.assert_allclose(spatial.errors(fixed), [*each, np.sqrt(np.sum(each**2))], rtol=1e-12)
+
+
+def test_what_is_not_significant_has_a_limit():
+    """Shared noise counts from 3.9 errors on, correlation where the spectrum says so."""
+    found = pairs_output._shared(0.62, 0.05, np.sqrt(0.62))
+    check(found, np.sqrt(0.62), 0.05 / (2 * np.sqrt(0.62)), "DN", Z)
+    found = pairs_output._shared(0.19, 0.05, np.sqrt(0.19))
+    assert found["value"] == 0 and found["upper_limit"] == pytest.approx(np.sqrt(0.19 + Z * 0.05), rel=1e-6)
+    assert pairs_output._shared(-0.19, 0.05, 0.0)["upper_limit"] == pytest.approx(np.sqrt(Z * 0.05), rel=1e-6)
+    assert pairs_output._correlation(calibration())["upper_limit"] == pytest.approx(0.013 + Z * 0.02, rel=1e-6)
+    found = pairs_output._linearity(calibration())
+    assert (found["value"], found["largest"], found["levels"]) == (pytest.approx(1.4 / 3), 0.9, 3)
+    rows = SimpleNamespace(rows=Shared(0.62, 0.05, 3.0, 1e-9))
+    check(frames_output._row_noise(rows), np.sqrt(0.62), 0.05 / (2 * np.sqrt(0.62)), "DN", Z)
+    rows = SimpleNamespace(rows=Shared(0.07, 0.05, 1.2, 0.02))
+    assert frames_output._row_noise(rows)["upper_limit"] == pytest.approx(np.sqrt(0.07 + 2 * 0.05))
+
+
+def test_findings_of_emva_captures_begin_at_their_limits():
+    """Each one just above, and just below, the size that docs/calibration.md gives."""
+
+    def named(**changed):
+        return {finding.check for finding in findings(calibration(**changed))}
+
+    curve = vars(calibration().curve)
+    assert "linearity" in named()  # 0.21 %
+    assert "linearity" not in named(curve=SimpleNamespace(**{**curve, "at": lambda x: 0.22 * (x + 2) * 1.0019}))
+    assert "linearity" in named(curve=SimpleNamespace(**{**curve, "at": lambda x: 0.22 * (x + 2) * 0.9979}))
+    assert "light offset" not in named()  # 2.0 of 0.51
+    assert "light offset" in named(curve=SimpleNamespace(**{**curve, "offset": -2.05}))
+    assert "light" not in named() and "light" in named(curve=SimpleNamespace(**{**curve, "light_rms": 5.1e-4}))
+    assert "variance" not in named() and "variance" in named(level_rms=0.0021)
+    assert "variance" not in named(level_rms=0.0021, level_chance=1.1e-4)
+    assert {"row noise", "column noise"} & named() == {"row noise"}
+    assert {"row noise", "column noise"} & named(row=(0.19, 0.05), col=(0.12, 0.03)) == {"column noise"}
+    # columns, DN², whose error on this device is √((4 (c + 1.7/14) 0.017 + 2 · 0.017²)/21): 0.0284 and 0.0273
+    for columns, is_seen in ((0.12, True), (0.10, False)):
+        some = SpatialVariance(0.31, columns, 1.7, (0.011, 0.017, 0.13), (13, 21, 273))
+        assert ("column pattern" in named(long_dark=SimpleNamespace(spatial=some))) is is_seen
+    limit = 3 * np.sqrt(0.62 / (2 * 14)) + 0.01
+    black = vars(calibration().black)
+    for factor in (0.99, 1.01):
+        changed = SimpleNamespace(**{**black, "rms": factor * limit})
+        assert ("black level" in named(black=changed)) is (factor > 1)
+
+
+def test_histograms_of_noise_are_densities_beside_that_of_their_law():
+    """20,000 values about the mean of 5 frames; their law is normal with the polynomial's variance, 1/12 and rows."""
+    rng = np.random.default_rng(6)
+    beta = np.array([5.0, 0.4, 30.0, 0.001, 0.0, 0.0])
+    signal, t = 70.0, 0.02
+    sigma = np.sqrt(beta @ [1, signal, t, signal**2, signal * t, t**2] + 1 / 12 + 0.6)
+    stack = 200 + sigma * rng.standard_normal((5, 100, 200))
+    series = SimpleNamespace(first=stack[0], mean=stack.mean(axis=0), frames=5)
+    result = SimpleNamespace(
+        fit=SimpleNamespace(beta=beta), row=(0.6, 0.1),
+        pairs=SimpleNamespace(spatial_lit=SimpleNamespace(exposure_s=t)),
+    )  # fmt: skip
+    of_pairs = pairs_output._histogram(result, series, signal)
+    moments = SimpleNamespace(frames=5, first=stack[:1], mean=stack.mean(axis=0)[None], exposures_s=[t])
+    mask = np.ones((100, 200), bool)
+    shared = Shared(0.6, 0.1, 9.0, 1e-9)
+    of_frames = frames_output._noise_histogram(
+        moments, 0, np.full(mask.shape, signal), mask, np.broadcast_to(beta, (1, 1, 6)), shared
+    )
+    for found in (of_pairs, of_frames):
+        place, counted, predicted = found.T
+        width = place[1] - place[0]
+        assert place[0] - width / 2 == pytest.approx(-5 * sigma) and place.size == 2 * max(12, int(5 * sigma))
+        np.testing.assert_allclose(place, -place[::-1], atol=1e-9)
+        exact = (norm.cdf((place + width / 2) / sigma) - norm.cdf((place - width / 2) / sigma)) / width
+        np.testing.assert_allclose(predicted, exact, rtol=1e-6, atol=1e-12)
+        # 20,000 values: 4.5 binomial errors of each bin
+        np.testing.assert_allclose(counted, exact, atol=4.5 * np.sqrt(exact.max() / width / 20_000))
+        assert counted.sum() * width == pytest.approx(1, abs=2e-4)
+
+
+@pytest.mark.parametrize(("law", "power"), [("sqrt", 1), ("linear", 2)])
+def test_beta_and_noise_of_trials_have_errors_of_the_delta_method(law, power):
+    """σ² = (s Iᵖ + d)/(1 + r I)² with s = β3², d = β4²; derivatives by hand."""
+    names, of = trials_output.NAMES, trials_output
+    covariance = np.random.default_rng(8).standard_normal((len(names), len(names)))
+    covariance = covariance.T @ covariance * 1e-6
+    r, s, d = 0.07, 0.0013, 0.0009
+    values = np.zeros(len(names))
+    values[[*of.THETA, of.RESPONSE, of.SHOT, of.DARK]] = 0.21, 0.29, r, s, d
+    fit = SimpleNamespace(
+        values=values, covariance=covariance, law=law, free=np.ones(len(names), bool),
+        value=lambda name: values[names.index(name)],
+    )  # fmt: skip
+    beta, error = of._beta(fit)
+    sizes = np.sqrt(np.diag(covariance))
+    assert beta == pytest.approx([0.25, r, 1.0, np.sqrt(s), np.sqrt(d), 0.0])
+    both = np.sqrt(covariance[0, 0] + covariance[1, 1] + 2 * covariance[0, 1]) / 2
+    shot, dark = sizes[of.SHOT] / (2 * np.sqrt(s)), sizes[of.DARK] / (2 * np.sqrt(d))
+    assert error[:5] == pytest.approx([both, sizes[of.RESPONSE], 0.0, shot, dark]) and error[5] is None
+    light = 31.0
+    sigma = np.sqrt(s * light**power + d) / (1 + r * light)
+    slope = np.zeros(len(names))
+    slope[of.RESPONSE] = -sigma * light / (1 + r * light)
+    slope[of.SHOT] = light**power / (2 * sigma * (1 + r * light) ** 2)
+    slope[of.DARK] = 1 / (2 * sigma * (1 + r * light) ** 2)
+    found = of._noise(fit, light)
+    assert found["value"] == pytest.approx(sigma, rel=1e-4)  # with the least noise, a thousandth of θ
+    assert found["standard_error"] == pytest.approx(np.sqrt(slope @ covariance @ slope), rel=1e-3)
+    fit.free = np.isin(np.arange(len(names)), (of.SHOT, 0))
+    assert of._noise(fit, light)["standard_error"] == pytest.approx(sizes[of.SHOT] * slope[of.SHOT], rel=1e-3)
+    assert of._beta(fit)[0][4] == 0.0 and of._beta(fit)[1][4] is None

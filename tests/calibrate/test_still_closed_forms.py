@@ -1,0 +1,251 @@
+"""Figures of still recordings: sums over events one by one, jackknives written out, lines of exact rates."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from hesim_render.calibrate.recordings import still, target
+from hesim_render.calibrate.recordings.short_intervals import readout_limit
+from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, SLICES, EventTally, tally
+from hesim_render.exchange import EventStream
+from hesim_render.pixels.evs.events import EVENT_DTYPE
+
+SHAPE, SECONDS = (5, 8), 0.06
+PIXELS = 40
+
+
+def events_of(rng, count=3000, begin_us=700):
+    events = np.zeros(count, EVENT_DTYPE)
+    events["t_us"] = begin_us + np.sort(np.concatenate([[0, 60_000], rng.integers(0, 60_001, count - 2)]))
+    events["x"], events["y"] = rng.integers(0, 8, count), rng.integers(0, 5, count)
+    events["polarity"] = rng.choice([-1, 1], count, p=[0.4, 0.6])
+    return events
+
+
+def test_a_tally_is_what_a_loop_over_events_counts():
+    events = events_of(np.random.default_rng(1))
+    found = EventTally("x", SHAPE, 700, 60_700)
+    for block in np.array_split(events, 7):
+        found.add(block)
+    found.finish()
+    assert found.seconds == pytest.approx(SECONDS) and found.pixels == PIXELS
+    counts, slices = np.zeros((2, 2, PIXELS)), np.zeros((2, SLICES, GROUPS))
+    intervals, windows = np.zeros(LONG_US + 1), np.zeros(61)
+    variation, pairs, turns = np.zeros(GROUPS), np.zeros(GROUPS), []
+    last, last_on, was_on, turned = {}, {}, {}, {}
+    group = found.group.astype(int)
+    for t, x, y, polarity in events[["t_us", "x", "y", "polarity"]].tolist():
+        pixel, k, part = y * 8 + x, int(polarity < 0), (t - 700) / 60_000
+        counts[k, min(int(2 * part), 1), pixel] += 1
+        slices[k, min(int(SLICES * part), SLICES - 1), group[pixel]] += 1
+        windows[(t - 700) // 1000] += 1
+        if pixel in last:
+            intervals[min(t - last[pixel], LONG_US)] += 1
+            if polarity > 0 and not was_on[pixel]:
+                if pixel in turned:
+                    turns.append(t - turned[pixel])
+                turned[pixel] = t
+        last[pixel], was_on[pixel] = t, polarity > 0
+        if polarity > 0:
+            before = last_on.get(pixel, [])
+            if len(before) == 2 and before[1] > before[0] and t > before[1]:
+                a, b = t - before[1], before[1] - before[0]
+                variation[group[pixel]] += 3 * ((a - b) / (a + b)) ** 2
+                pairs[group[pixel]] += 1
+            last_on[pixel] = [*before, t][-2:]
+    np.testing.assert_array_equal(found.counts, counts)
+    np.testing.assert_array_equal(found.slices, slices)
+    np.testing.assert_array_equal(found.intervals, intervals)
+    np.testing.assert_array_equal(found.windows[1:], np.bincount(windows.astype(int))[1:])
+    np.testing.assert_array_equal(found.pairs, pairs)
+    np.testing.assert_allclose(found.variation, variation)
+    every = np.array(turns)
+    near = every[np.abs(every / np.median(every) - 1) < 0.3]
+    assert found.period_s() == pytest.approx(near.mean() * 1e-6)
+    np.testing.assert_array_equal(found.per_pixel(), counts.sum(axis=1))
+
+
+def test_rates_spread_and_regularity_have_the_errors_of_leaving_groups_out():
+    rng = np.random.default_rng(2)
+    one = tally(EventStream.of(events_of(rng), SHAPE))
+    one.counts[:] = rng.poisson(rng.uniform(20, 80, PIXELS), (2, 2, PIXELS))
+    one.slices[:] = rng.integers(1, 30, one.slices.shape)
+    group = one.group.astype(int)
+    rates = still.group_rates(one)
+    of_group = one.slices.sum(axis=1)
+    assert rates[:, 0] == pytest.approx(of_group.sum(axis=1) / (PIXELS * SECONDS))
+    for k in range(GROUPS):
+        left = PIXELS - np.sum(group == k)
+        assert rates[:, 1 + k] == pytest.approx((of_group.sum(axis=1) - of_group[:, k]) / (left * SECONDS))
+    error = [np.sqrt(19 / 20 * np.sum((r[1:] - r[1:].mean()) ** 2)) for r in rates]
+    assert still.jackknife(rates) == pytest.approx(error)
+    for polarity in (0, 1):
+        told = still.rate(rates, polarity)
+        assert (told["value"], told["standard_error"]) == pytest.approx((rates[polarity, 0], error[polarity]))
+
+    def relative(a, b):
+        return (np.mean(a * b) - a.mean() * b.mean()) / (a.mean() * b.mean())
+
+    told = still.rate_spread(one, 1)
+    first, second = one.counts[1].astype(float)
+    parts = [relative(first[group != k], second[group != k]) for k in range(GROUPS)]
+    error = np.sqrt(19 / 20 * np.sum((np.array(parts) - np.mean(parts)) ** 2))
+    whole = relative(first, second)
+    assert whole > 2 * error
+    assert told["value"] == pytest.approx(np.sqrt(whole))
+    assert told["standard_error"] == pytest.approx(error / (2 * np.sqrt(whole)))
+    one.variation, one.pairs = rng.uniform(3, 9, GROUPS), rng.integers(8, 14, GROUPS)
+    total, count = one.variation.sum(), one.pairs.sum()
+    parts = (total - one.variation) / (count - one.pairs)
+    told = still.regularity(one)
+    assert told["value"] == pytest.approx(total / count)
+    assert told["standard_error"] == pytest.approx(np.sqrt(19 / 20 * np.sum((parts - parts.mean()) ** 2)))
+    one.pairs = np.full(GROUPS, 10)
+    assert still.regularity(one)["value"] is not None
+    one.pairs[3] = 9
+    assert "199 pairs" in still.regularity(one)["reason"]
+
+
+@pytest.mark.parametrize("off", [1, 0])
+def test_a_pixel_is_hot_beyond_the_tail_of_ten_times_the_usual_rate(off):
+    """Usual is the mean of the lower nine tenths and one event over all pixels; the chance is 1e-3 over the pixels."""
+    usual = (18 * 30 + 18 * 50) / 36 + 1 / PIXELS
+    least = stats.poisson.isf(1e-3 / PIXELS, 10 * usual)
+    counts = np.array([30] * 18 + [50] * 18 + [60] * 3 + [int(least) + 1 - off])
+    one = SimpleNamespace(pixels=PIXELS, per_pixel=lambda: np.stack([counts, 0 * counts]))
+    assert still.hot_pixels([one, one]).sum() == 1 - off
+
+
+def slices_tally(per_slice):
+    """Counts of 20 slices of a recording of 40 pixels and 2 s."""
+    slices = np.zeros((2, SLICES, GROUPS))
+    slices[0, :, 3], slices[1, :, 5] = np.asarray(per_slice) * 0.75, np.asarray(per_slice) * 0.25
+    return SimpleNamespace(slices=slices, pixels=PIXELS, seconds=2.0)
+
+
+def test_a_scene_is_not_still_beyond_half_of_its_rate_or_a_burst():
+    even = np.full(20, 4000.0)
+    assert still.not_still(slices_tally(even)) is None
+    steps = even.copy()
+    steps[:5], steps[-5:] = 4000 * 0.755, 4000 * 1.245  # a difference of 0.49 of the mean
+    assert still.not_still(slices_tally(steps)) is None
+    steps[:5], steps[-5:] = 4000 * 0.745, 4000 * 1.255
+    told = still.not_still(slices_tally(steps))
+    # 2980 and 5020 events of 40 pixels in 0.1 s
+    assert "its rate goes from 745 to 1255 Hz a pixel, at most 1255" in told
+    assert "its rate goes from 1255 to 745" in still.not_still(slices_tally(steps[::-1]))
+    for factor, is_told in ((0.99, False), (1.03, True)):
+        burst = np.full(20, 400.0)
+        # c of 19 · 400 + c is beyond the tail of three times the mean at c ≈ 1530
+        high = next(c for c in range(400, 4000, 4) if c > stats.poisson.isf(1e-3 / 20, 3 * (19 * 400 + c) / 20))
+        burst[9] = 4 * round(factor * high / 4)
+        assert (still.not_still(slices_tally(burst)) is not None) is is_told
+
+
+def rates_of(rng, lux, ratio, dark, growth, scatter=0.0):
+    """[recording, polarity, k] of leaks that follow the light exactly; each group is off by as much as it likes."""
+    off = np.array([0.7, 0.2, 0.05])[: len(lux), None] * (1 + 0.05 * rng.standard_normal(GROUPS + 1))
+    on = ratio * off + dark + growth * np.asarray(lux)[:, None] + scatter * rng.standard_normal((len(lux), GROUPS + 1))
+    return np.stack([on, off], axis=1)
+
+
+def test_the_balance_of_three_lights_gives_ratio_and_leak():
+    rng, lux = np.random.default_rng(3), [2.0, 60.0, 700.0]
+    rates = rates_of(rng, lux, 1.3, 0.5, 1e-3, 1e-5)
+    np.testing.assert_allclose(still._three_lights(rates, np.array(lux)), 1.3, rtol=2e-3)
+    rates[:, 1] = rates[:1, 1] * 0 + np.array(lux)[:, None]  # OFF events that follow the light
+    assert np.isnan(still._three_lights(rates, np.array(lux))).all()
+
+
+def test_a_leak_follows_a_line_weighted_by_both_kinds_of_error():
+    """Scatter of groups and an error of its own, of which only the first is that of the jackknife."""
+    rng = np.random.default_rng(4)
+    leak = np.array([0.5, 0.61, 1.3, 9.0])[:, None] + np.array([0.01, 0.03, 0.02, 0.1])[:, None] * rng.standard_normal(
+        (4, GROUPS + 1)
+    )
+    unknown, lux = np.array([0.05, 0.02, 0.11, 0.0]), [2.0, 60.0, 700.0, 9.0]
+    known = np.array([True, True, True, False])
+    dark, growth = still._line(leak, unknown, known, lux)
+    error = np.hypot(still.jackknife(leak[:3]), unknown[:3])
+    fits = np.array([np.polyfit(lux[:3], leak[:3, k], 1, w=1 / error)[::-1] for k in range(GROUPS + 1)]).T
+    design = np.stack([np.ones(3), lux[:3]], axis=1) / error[:, None]
+    line = np.linalg.inv(design.T @ design) @ (design / error[:, None]).T
+    for told, fit, row, unit in zip((dark, growth), fits, line, ("Hz", "Hz/lx"), strict=True):
+        own = np.sqrt(19 / 20 * np.sum((fit[1:] - fit[1:].mean()) ** 2))
+        assert told["value"] == pytest.approx(fit[0]) and told["unit"] == unit
+        assert told["standard_error"] == pytest.approx(np.sqrt(own**2 + np.sum((row * unknown[:3]) ** 2)))
+    assert "at 1 lights" in still._line(leak, unknown, known, [5.0, 5.0, 5.0, 1.0])[0]["reason"]
+
+
+def test_leaks_without_a_ratio_are_known_where_off_events_hardly_count():
+    """Half of the range 0.5 to 2 of the ratio times the OFF rate: up to a hundredth of the ON rate, or the scatter."""
+    rates = np.tile(np.array([[10.0], [0.13]]), GROUPS + 1)
+    told = still._leak_alone(rates, "why")
+    assert told["value"] == pytest.approx(9.87) and told["standard_error"] == pytest.approx(0.75 * 0.13)
+    rates[1] = 0.134
+    assert "OFF events come at 0.134 Hz" in still._leak_alone(rates, "why")["reason"]
+    rates[0, 1:] += np.linspace(-0.05, 0.05, GROUPS)  # 0.1006 > 0.75 · 0.134 = 0.1005
+    scatter = still.jackknife(rates[0] - rates[1])
+    assert (still._leak_alone(rates, "why")["value"] is None) is bool(scatter < 0.75 * 0.134)
+
+
+def test_a_target_tells_each_pixels_ratio_and_so_its_leak():
+    """Pixels with θ₋/θ₊ of 0.8 to 1.5 and a leak of 3 Hz: counts that balance exactly give it back."""
+    rng = np.random.default_rng(5)
+    group = np.arange(PIXELS) % GROUPS
+    ratio = rng.uniform(0.8, 1.5, PIXELS)
+    off = rng.integers(40, 90, PIXELS).astype(float)
+    moving = SimpleNamespace(
+        per_pixel=lambda: np.stack([ratio * off + 3.0 * 4.0, off]), seconds=4.0, group=group.astype(np.uint64)
+    )
+    tallies = []
+    for leak, quiet in ((0.7, 30.0), (1.9, 11.0)):
+        count = quiet * rng.uniform(0.5, 1.5, PIXELS)
+        both = np.stack([ratio * count + leak * 2.5, count])
+        slices = np.zeros((2, SLICES, GROUPS))
+        for polarity in (0, 1):
+            slices[polarity, 0] = np.bincount(group, both[polarity], GROUPS)
+        tallies.append(
+            SimpleNamespace(per_pixel=lambda both=both: both, seconds=2.5, slices=slices, pixels=PIXELS, group=group)
+        )
+    found = still.balance_with_target(tallies, [5.0, 80.0], moving, {"value": 1.1}, 3.0)
+    assert found.ratio == {"value": 1.1}
+    assert [leak["value"] for leak in found.leaks] == pytest.approx([0.7, 1.9])
+    # a tenth of the target's leak is not known: each pixel's ratio is off by 0.1 · 3 · 4 over its OFF events
+    for leak, one in zip(found.leaks, tallies, strict=True):
+        unsure = 0.1 * 12 * np.mean(1 / off) * one.slices[1].sum() / (PIXELS * 2.5)
+        assert leak["standard_error"] == pytest.approx(unsure)
+    assert found.dark["value"] == pytest.approx(0.7 - 1.2 * 5 / 75)
+    assert found.growth["value"] == pytest.approx(1.2 / 75)
+
+
+def test_simulated_pixels_count_their_thresholds_in_the_swing():
+    """Without spread and after the turns have settled: as many thresholds as lie between them, and slopes alike."""
+    simulated = target._Simulated(2.1, 12)
+    on, off, _ = simulated.moments(np.array([0.2, 0.3, 0.0]))
+    # between the turns lie 2.1 less half a threshold of either kind, in the mean over places of the first turn
+    assert on * 0.2 == pytest.approx(off * 0.3, rel=1e-3) and on * 0.2 == pytest.approx(2.1 - 0.25, abs=0.06)
+    values, slope = simulated.fit(simulated.moments(np.array([0.22, 0.31, 0.09**2])))
+    assert values == pytest.approx([0.22, 0.31, 0.0081], rel=0.02)
+    assert slope[0, 0] == pytest.approx(-on / 0.2, rel=0.25) and slope[1, 1] == pytest.approx(-off / 0.3, rel=0.25)
+
+
+def test_the_readout_limit_is_the_mean_of_the_fullest_windows():
+    """30 windows of 198 to 200 events of 170 pixels; half of two events is what the limit may be off by."""
+    windows = np.zeros(201, np.int64)
+    windows[[198, 199, 200]], windows[150] = (5, 15, 10), 20
+    one = SimpleNamespace(windows=windows, pixels=170)
+    found, limited = readout_limit([one])
+    value = (5 * 198 + 15 * 199 + 10 * 200) / 30
+    assert found["value"] == pytest.approx(1000 * value) and found["standard_error"] == pytest.approx(500)
+    assert found["interval_95"] == pytest.approx([1000 * (value - 1), 1000 * (value + 1)]) and limited == [one]
+    windows[150] = 271  # 30 of 301 are less than a tenth
+    assert readout_limit([one])[1] == []
+    windows[[195, 196, 197]] = 2, 2, 3  # 7 just below: 30 are not five times as many
+    assert "no two of the fullest windows" in readout_limit([one])[0]["reason"]
+    windows[197] = 2
+    assert readout_limit([one])[0]["value"] is not None
+    windows[[198, 199, 200]] = 4, 10, 5  # 19 are too few
+    assert "it is at least 2e+05 events/s" in readout_limit([one])[0]["reason"]

@@ -1,0 +1,286 @@
+"""Counts of event pixels: cells by a loop, tails of defects, rates of first events, losses and floors by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.stats import norm, poisson
+
+from hesim_render.calibrate.asynchronous import checks as trial_checks
+from hesim_render.calibrate.asynchronous import defects
+from hesim_render.calibrate.asynchronous.likelihood import LEAK, NAMES, RESPONSE
+from hesim_render.calibrate.asynchronous.trials import Parts, Trials
+from hesim_render.calibrate.evs import fitted, medians
+from hesim_render.calibrate.evs.cells import Cells, PixelThresholds, brightness_edges, pool_events
+from hesim_render.calibrate.evs.model import log_likelihood, log_probability
+from hesim_render.calibration.spec import Defect
+
+
+@pytest.mark.parametrize("position", [None, 1])
+def test_cells_are_sums_over_pixels_of_like_brightness_and_threshold(position):
+    """A loop over 12 by 9 pixels, some of them counted twice or not at all; the dark is a brightness of its own."""
+    rng, shape = np.random.default_rng(1), (12, 9)
+    signal = rng.choice([5.0, 5.01, 80.0, 300.0], shape)
+    counts = [rng.integers(0, 90, shape) for _ in range(4)]
+    good, weight = rng.random(shape) < 0.8, rng.integers(0, 3, shape)
+    tile = np.add.outer(np.arange(12) % 2, np.arange(9) % 2)
+    static = SimpleNamespace(
+        signal_dn=signal, position=tile, sessions=[(signal, *counts[:2]), (0 * signal, *counts[2:])], trials=100
+    )
+    about = [1 + 0.02 * rng.standard_normal(shape) for _ in range(2)]
+    known = PixelThresholds(*about, *rng.uniform(0.01, 0.1, (2, *shape)))
+    found = pool_events(static, good, known, position, weight)
+    take = good if position is None else good & (tile == position)
+    edges = brightness_edges(signal[good])
+    sums = {}
+    for session, (light, *both) in enumerate(static.sessions):
+        for k, (sign, events) in enumerate(zip((1.0, -1.0), both, strict=True)):
+            relative, left = (known.on, known.on_spread) if sign > 0 else (known.off, known.off_spread)
+            for place in np.argwhere(take):
+                at = tuple(place)
+                step = round(relative[at] / 0.01)
+                key = (session, k, 0 if session else np.searchsorted(edges, signal[at], side="right"), step)
+                sums.setdefault(key, []).append((weight[at], light[at], relative[at], left[at], events[at]))
+    wanted = []
+    for key in sorted(sums):
+        w, x, r, own, n = np.array(sums[key]).T
+        total = max(w.sum(), 1e-30)
+        centre = w @ r / total
+        wanted.append((w @ x / total, 1.0 - 2 * key[1], centre, np.sqrt(w @ (own**2 + (r - centre) ** 2) / total),
+                       w.sum(), w @ n))  # fmt: skip
+    table = found.cells
+    told = np.stack([table.signal_dn, table.polarity, table.relative, table.spread, table.pixels, table.events], axis=1)
+    np.testing.assert_allclose(told, wanted, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(found.counts, [c[take] for c in counts])
+    assert found.is_dark.tolist() == [False, False, True, True] and found.polarity.tolist() == [1, -1, 1, -1]
+    np.testing.assert_array_equal(table.total, 100 * table.pixels)
+    one = found.single(3)
+    assert not one.signal_dn.any() and np.all(one.polarity == -1) and one.trials == 100
+    np.testing.assert_allclose(one.relative, known.off[take], rtol=1e-6)
+    np.testing.assert_allclose(found.single(0).signal_dn, signal[take])
+
+
+def test_coarser_cells_keep_sums_and_variances():
+    """300 cells of ON and 5 of OFF in at most 40 each: sums and means stay, the scatter within is spread."""
+    rng = np.random.default_rng(2)
+    sizes, polarity = rng.uniform(1, 9, 305), np.repeat([1.0, -1.0], (300, 5))
+    fine = Cells(rng.uniform(1, 100, 305), polarity, rng.uniform(0.8, 1.2, 305), rng.uniform(0.02, 0.1, 305), sizes,
+                 rng.uniform(0, 50, 305), 70)  # fmt: skip
+    found = fine.coarser(40)
+    assert np.sum(found.polarity == 1) == 40 and np.sum(found.polarity == -1) == 5 and found.trials == 70
+    for sign in (1.0, -1.0):
+        before, after = fine.polarity == sign, found.polarity == sign
+        assert np.all(np.diff(found.signal_dn[after]) > 0)
+        assert found.events[after].sum() == pytest.approx(fine.events[before].sum())
+        assert found.pixels[after].sum() == pytest.approx(sizes[before].sum())
+        for name in ("signal_dn", "relative"):
+            assert found.pixels[after] @ getattr(found, name)[after] == pytest.approx(
+                sizes[before] @ getattr(fine, name)[before]
+            )
+        squares = [c.pixels[w] @ (c.spread**2 + c.relative**2)[w] for c, w in ((found, after), (fine, before))]
+        assert squares[0] == pytest.approx(squares[1])
+    assert np.ptp(np.sort(found.pixels[found.polarity == 1])) < 40  # seven or eight cells each
+    near = fine.typical()
+    assert np.all(np.abs(near.relative - 1) <= 0.1) and near.pixels.size == np.sum(np.abs(fine.relative - 1) <= 0.1)
+    np.testing.assert_allclose(fine.with_spread(1.7).spread, 1.7 * fine.spread)
+
+
+def test_bins_of_brightness_are_as_narrow_as_they_promise():
+    """0.5 % of the range, 2 % of the brightness down to 1e-4 of the brightest, and 1 % of the pixels at most."""
+    rng = np.random.default_rng(3)
+    signal = np.concatenate([rng.uniform(40, 50, 9000), np.geomspace(0.01, 1000, 1001)])
+    edges = np.concatenate([[signal.min()], brightness_edges(signal), [signal.max()]])
+    width = np.diff(edges)
+    assert np.all(width > 0)
+    assert width.max() <= 1000 / 192 * 1.0001
+    bright = edges[1:] > 0.1001
+    assert np.all((width / edges[1:])[bright] <= 0.0194)  # 480 steps over four decades
+    assert np.histogram(signal, edges)[0].max() <= 1.2 * signal.size / 96
+
+
+def test_likelihood_of_events_is_the_binomial_one():
+    rng = np.random.default_rng(4)
+    p, total = rng.uniform(0.01, 0.9, 6), rng.integers(50, 90, 6).astype(float)
+    events = np.floor(rng.uniform(0, 1, 6) * total)
+    given = Cells(np.ones(6), np.ones(6), np.ones(6), np.zeros(6), total / 10, events, 10)
+    wanted = np.sum(events * np.log(p) + (total - events) * np.log1p(-p))
+    assert float(log_likelihood(given, np.log(p))) == pytest.approx(wanted)
+
+
+def test_terms_that_are_left_out_change_nothing_else():
+    """g = (1 + e y)² + w y²: without D (e) the square of y keeps its factor C² = w + e²."""
+    eta = np.array([0.01, -0.2, 0.3, 0.4, 0.05, 0.001])
+    assert fitted._without(eta, 3) == pytest.approx([0.01, -0.2, 0.3 + 0.16, 0.0, 0.05, 0.001])
+    assert fitted._without(eta, 2) == pytest.approx([0.01, -0.2, 0.0, 0.4, 0.05, 0.001])
+    root = np.random.default_rng(5).standard_normal((9, 6)) * 10.0 ** np.array([0, -6, 4, 2, -3, 5])
+    covariance, mixed = fitted._covariance(root.T @ root)
+    np.testing.assert_allclose(covariance, np.linalg.inv(root.T @ root), rtol=1e-6)
+    assert mixed == []
+    root[:, 2] = 1e4 * root[:, 0] + 3e9 * root[:, 1]
+    assert fitted._covariance(root.T @ root)[1] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.2])
+def test_the_variance_of_a_cell_is_that_of_counting_and_of_thresholds(spread):
+    """Pixels · (n p q + n (n − 1) Var p), the mean over thresholds by quadrature."""
+    eta = np.array([0.004, np.log(0.9), 1e-5, 5e-4, 0.06, 0.0])
+    given = Cells(np.array([40.0, 900.0]), np.array([1.0, -1.0]), np.array([1.05, 0.97]), np.full(2, spread),
+                  np.array([70.0, 31.0]), np.zeros(2), 50)  # fmt: skip
+    found = fitted.cell_variance(given, eta, 2.3, "linear")
+    y = given.signal_dn
+    u = 2.3 * (0.004 * y + 0.9) / np.sqrt(2 * ((1 + 5e-4 * y) ** 2 + 1e-5 * y**2))
+    z, w = np.polynomial.hermite_e.hermegauss(60)
+    p = norm.sf(((1 - given.polarity * 0.06) * u)[:, None] * (given.relative[:, None] + spread * z))
+    mean, square = p @ w / w.sum(), p**2 @ w / w.sum()
+    between = square - mean**2
+    plain = given.pixels * (50 * mean * (1 - mean) + (50 * 49 if spread else 0) * between)
+    np.testing.assert_allclose(found, plain, rtol=0.03)
+    if not spread:
+        np.testing.assert_allclose(np.exp(log_probability(eta, given, 2.3, "linear")[0]), mean, rtol=1e-6)
+
+
+def test_groups_of_like_brightness_are_of_200_pixels_or_more():
+    signal = np.random.default_rng(6).permutation(np.arange(950.0))
+    group = medians.like_brightness(signal)
+    np.testing.assert_array_equal(group, np.minimum(signal.astype(int) // 200, 3))
+    parts = medians.by_group(signal, group)
+    assert [part.size for part in parts] == [200, 200, 200, 350] and all(np.all(g == k) for k, g in enumerate(
+        medians.by_group(group, group)))  # fmt: skip
+    assert np.bincount(medians.like_brightness(np.arange(900.0), 3)).tolist() == [300, 300, 300]
+
+
+def trials_of(on, off, calm, signal, contrast=None, parts=None, settle_s=0.3):
+    """[kind, bin, pixel] events of trials with bins that end at 0.1 and 0.5 s."""
+    contrast = np.zeros(len(signal)) if contrast is None else np.asarray(contrast, float)
+    return Trials(
+        signal_dn=np.asarray(signal, float), contrast=contrast, settle_s=settle_s, edges_s=np.array([0.0, 0.1, 0.5]),
+        calm=np.asarray(calm), on=np.asarray(on), off=np.asarray(off), parts=parts, shape=(1, np.shape(calm)[1]),
+    )  # fmt: skip
+
+
+def test_rates_of_first_events_are_those_of_an_exponential_law():
+    """−ln(1 − events/calm)/0.5 s, three quarters of them ON; where a tenth is calm, from the 0.3 s of settling."""
+    on = np.array([[[20, 0, 0, 3], [10, 0, 0, 3]]])
+    off = np.array([[[6, 0, 0, 0], [4, 0, 0, 2]]])
+    steady = trials_of(on, off, [[100, 100, 10, 8]], [50.0])
+    never = np.array([False, False, True, False])
+    found = defects._own_rates(steady, 0, never, 100.0)
+    total = np.array([-np.log(0.6) / 0.5, 0.0, -np.log(0.1) / 0.3, np.log(8 / 0.5) / 0.5])
+    share = np.array([0.75, 1.0, 1.0, 0.75])
+    np.testing.assert_allclose(found, np.stack([share, 1 - share]) * total)
+
+
+def test_flickering_pixels_fire_at_a_rate_of_their_own_while_they_do():
+    """2 pixels: trials with an event in the parts in which they fire; the usual share of good pixels is taken off."""
+    rng = np.random.default_rng(7)
+    chance, usual, trials = np.array([0.6, 0.4]), 0.05, 40
+    state = np.zeros((400 * trials, 2), bool)
+    for k in range(1, state.shape[0]):  # the state is kept with 0.99 from trial to trial
+        state[k] = np.where(rng.random(2) < 0.99, state[k - 1], rng.random(2) < [0.3, 0.5])
+    disturbed = np.empty((400, 12), int)
+    fires = rng.random(state.shape) < usual + (chance - usual) * state
+    disturbed[:, :2] = fires.reshape(400, trials, 2).sum(axis=1)
+    disturbed[:, 2:] = rng.binomial(trials, usual, (400, 10))
+    bad = np.arange(12) < 2
+    nothing = np.zeros(12, np.float32)
+    result = defects.TrialDefects(bad, np.zeros(12, np.uint8), nothing, nothing.copy(), np.ones(12, np.float32),
+                                  nothing.copy())  # fmt: skip
+    defects._flicker(result, np.arange(2), Parts(disturbed, trials, 0.7), np.array([[3.0, 1.0], [1.0, 1.0]]))
+    share = state.mean(axis=0)
+    np.testing.assert_allclose(result.firing_share[:2], share, rtol=0.12)
+    seen = (disturbed[:, :2].mean(axis=0) / trials - disturbed[:, 2:].mean() / trials) / result.firing_share[:2]
+    rate = -np.log1p(-seen) / 0.7
+    np.testing.assert_allclose(result.on_hz[:2], rate * [0.75, 0.5], rtol=1e-3)
+    np.testing.assert_allclose(result.off_hz[:2], rate * [0.25, 0.5], rtol=1e-3)
+    np.testing.assert_allclose(result.change_hz[:2], -np.log(0.99) / 0.7, rtol=0.3)
+    assert not result.on_hz[2:].any() and np.all(result.firing_share[2:] == 1)
+
+
+@pytest.mark.parametrize("more", [0, 1])
+def test_pixels_are_plainly_bad_by_polarity_calm_and_events_in_the_brightest_light(more):
+    """400 pixels with 5 events of the usual ones: a tail of 1e-7 begins at `least`; half of the calm trials count."""
+    pixels = 400
+    usual = 5.0
+    least = next(n for n in range(60) if poisson.sf(n - 1, usual) < 1e-7)
+    steady_on = np.zeros((2, 2, pixels), int)
+    steady_on[1, 0] = 5
+    steady_on[1, 1, 11] = least - 5 - 1 + more  # in the other bin
+    steady_on[0, 0, 12] = 90  # of a dim light: that is not judged
+    calm = np.full((2, pixels), 200)
+    calm[1, 30] = 99 + more
+    steps_on, steps_off = (np.ones((2, 2, pixels), int) for _ in range(2))
+    steps_on[:, :, 40] = 0
+    steps_off[:, :, 41] = 0
+    steady = trials_of(steady_on, 0 * steady_on, calm, [3.0, 80.0])
+    steps = trials_of(steps_on, steps_off, np.full((2, pixels), 50), [80.0, 80.0], [0.3, -0.3])
+    found = defects.plainly_bad(steady, steps)
+    assert np.flatnonzero(found).tolist() == [*([11] if more else []), *([] if more else [30]), 40, 41]
+
+
+def test_kinds_of_bad_pixels():
+    """Stuck: no event from a step; hot: hardly calm, or more events than chance gives (1e-3); else other."""
+    pixels = 50
+    steady_on = np.full((1, 2, pixels), 2)
+    calm = np.full((1, pixels), 200)
+    usual = 4 * 1.0
+    least = next(n for n in range(60) if poisson.sf(n - 1, usual) < 1e-3)
+    steady_on[0, :, 3] = least // 2, least - least // 2
+    steady_on[0, :, 4] = (least - 1) // 2, least - 1 - (least - 1) // 2
+    calm[0, 5] = 99
+    steps_on, steps_off = (np.ones((2, 2, pixels), int) for _ in range(2))
+    steps_on[:, :, [4, 6]] = steps_off[:, :, 6] = 0
+    bad = np.isin(np.arange(pixels), (3, 4, 5, 6))
+    steady = trials_of(steady_on, 0 * steady_on, calm, [80.0])
+    steps = trials_of(steps_on, steps_off, np.full((2, pixels), 50), [80.0, 80.0], [0.3, -0.3])
+    found = defects.classify(steady, steps, bad)
+    assert found.kind[[3, 4, 5, 6]].tolist() == [Defect.HOT, Defect.OTHER, Defect.HOT, Defect.STUCK]
+    assert not found.kind[~bad].any()
+    assert found.on_hz[3] == pytest.approx(-np.log1p(-least / 200) / 0.5, rel=1e-5) and found.on_hz[4] == 0
+    assert found.on_hz[5] == pytest.approx(-np.log(99 / 200) / 0.3, rel=1e-5)
+
+
+def test_losses_at_large_steps_are_told_from_one_in_a_thousand_on():
+    """200 pixels whose S-curves end at 1 − loss: steps beyond four spreads count, those of a dim light do not."""
+    size = np.array([0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.36, 0.8, 0.9])
+    contrast = np.concatenate([size, -size])
+    pixels, trials = 200, 2000
+    centre = 0.25 * (1 + 0.14 * norm.ppf((np.arange(pixels) + 0.5) / pixels))  # beyond four spreads lie 0.8 and 0.9
+    for loss, is_told in ((0.0013, True), (0.0007, False)):
+        events = np.rint(trials * norm.cdf((size[:, None] - centre) / 0.03) * (1 - loss))
+        on = np.zeros((18, 2, pixels))
+        off = on.copy()
+        on[:9, 0], off[9:, 0] = events, events
+        steps = trials_of(on, off, np.full((18, pixels), trials), np.full(18, 70.0), contrast)
+        found = trial_checks._ceiling(steps)
+        assert (found is not None) is is_told
+        if is_told:
+            assert f"in {np.rint(trials * loss) / trials:.2g} of the trials" in found.text
+
+
+def test_events_away_from_the_threshold_are_told_beyond_leak():
+    """OFF events after bright ON steps of more than half of θ, and ON events after OFF steps beyond those of leak."""
+    values = np.zeros(len(NAMES))
+    values[:2], values[LEAK], values[RESPONSE] = (0.2, 0.3), 0.02, 1e6
+    pixels, trials = 100, 500
+    contrast = np.array([0.4, 0.14, -0.4, -0.09])
+    on, off = np.zeros((2, 4, 2, pixels), int)
+    usual = 50_000 * 0.02 * 0.5
+    fit = SimpleNamespace(values=values)
+
+    def found():
+        steps = trials_of(on, off, np.full((4, pixels), trials), np.full(4, 60.0), contrast)
+        return trial_checks._floor(fit, steps)
+
+    on[2, 0] = 5  # 500 in 50,000 trials, as leak makes them
+    assert found() is None
+    off[1, 1], on[3, 1] = 50, 50  # after steps of less than half of a threshold
+    assert found() is None
+    off[0, 0, :50] = 1
+    told = found()
+    assert "0.001 (OFF) of the trials" in told.text
+    assert told.p_value == pytest.approx(2 * poisson.sf(49, 0.5))
+    on[2, 1] = 2
+    told = found()
+    assert "0.014 (ON) and 0.001 (OFF)" in told.text
+    off[0, 0] = 0
+    assert found().p_value == pytest.approx(2 * poisson.sf(699, usual + 0.5))

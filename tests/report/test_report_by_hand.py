@@ -1,0 +1,222 @@
+"""Errors and derived figures of test reports, from numbers given by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import special
+from scipy.stats import norm
+
+from hesim_render.report import emva, latency, limits, modulated, s_curves
+from hesim_render.report.estimates import crossing, log_estimated, mean_error, quantile, whole_us
+from hesim_render.report.latency import Answers
+from hesim_render.report.steady import Background, _rate, doubling
+
+Z = 1.959963984540054
+
+
+def test_the_error_of_a_mean_has_parts_of_pixels_and_of_jumps():
+    """Squares of the sums over pixels and over jumps less those of each value; invalid values are left out."""
+    rng = np.random.default_rng(1)
+    values = rng.standard_normal((6, 9)) + 2 * rng.standard_normal(9) + rng.standard_normal((6, 1))
+    valid = rng.random((6, 9)) < 0.8
+    mean, count = values[valid].mean(), valid.sum()
+    by_pixel = sum((values[valid[:, k], k] - mean).sum() ** 2 for k in range(9))
+    by_jump = sum((values[j, valid[j]] - mean).sum() ** 2 for j in range(6))
+    each = np.sum((values[valid] - mean) ** 2)
+    assert by_pixel > each and by_jump > each
+    assert mean_error(values, valid) == pytest.approx(np.sqrt(by_pixel + by_jump - each) / count)
+    # values that are all alike but for one: neither part may be below that of single values
+    alone = np.zeros((2, 2))
+    alone[0] = 1, -1
+    assert mean_error(alone, np.ones((2, 2), bool)) == pytest.approx(np.sqrt(2) / 4)
+    assert np.isnan(mean_error(alone, np.eye(2, dtype=bool) & False))
+
+
+def test_a_quantile_has_the_interval_of_the_share_below_it():
+    """20 jumps of 50 pixels, independent: 0.3 ± √(0.21/1000); whole µs are known to half of one on either side."""
+    values = np.random.default_rng(2).permutation(1000).reshape(20, 50).astype(float)
+    every = np.ones(values.shape, bool)
+    value, error, low, high = quantile(values, every, 0.3)
+    share = mean_error((values <= value).astype(float), every)
+    assert value == pytest.approx(np.quantile(values, 0.3)) and share == pytest.approx(np.sqrt(0.21 / 1000), rel=0.6)
+    ends = [np.quantile(values, 0.3 + z * share) for z in (-Z, Z)]
+    assert (low, high) == pytest.approx(ends) and error == pytest.approx((ends[1] - ends[0]) / (2 * Z))
+    told = whole_us((40.0, 3.0, 34.0, 47.0), 0.7)
+    assert told["value"] == pytest.approx(28) and told["interval_95"] == pytest.approx([0.7 * 33.5, 0.7 * 47.5])
+    assert told["standard_error"] == pytest.approx(0.7 * np.sqrt(9 + 1 / 12))
+    assert whole_us((0.2, 0.1, 0.1, 0.3))["interval_95"][0] == 0
+    told = log_estimated(np.log(5.0), 0.2, "lx")
+    assert told["value"] == pytest.approx(5) and told["standard_error"] == pytest.approx(1.0)
+    assert told["interval_95"] == pytest.approx([5 * np.exp(-0.2 * Z), 5 * np.exp(0.2 * Z)])
+
+
+def test_a_crossing_lies_on_a_line_of_probits_with_its_error():
+    x, share, error = (
+        np.array([0.0, 1.0, 2.5, 4.0]),
+        np.array([0.2, 0.5, 0.97, 1.0]),
+        np.array([0.01, 0.02, 0.007, 0.0]),
+    )
+    place, sure = crossing(x, share, error, 0.9, 400)
+    z = norm.ppf([0.5, 0.97, 0.9])
+    assert place == pytest.approx(1 + 1.5 * (z[2] - z[0]) / (z[1] - z[0]))
+
+    def at(a, b):
+        z = norm.ppf([a, b])
+        return 1 + 1.5 * (norm.ppf(0.9) - z[0]) / (z[1] - z[0])
+
+    h = 1e-6
+    slopes = [(at(0.5 + h, 0.97) - at(0.5 - h, 0.97)) / (2 * h), (at(0.5, 0.97 + h) - at(0.5, 0.97 - h)) / (2 * h)]
+    assert sure == pytest.approx(np.hypot(slopes[0] * 0.02, slopes[1] * 0.007), rel=1e-4)
+    # all of 400 answers count as 399.5
+    place, _ = crossing(x[2:], np.array([0.6, 1.0]), error[2:], 0.9, 400)
+    z = norm.ppf([0.6, 1 - 0.5 / 400, 0.9])
+    assert place == pytest.approx(2.5 + 1.5 * (z[2] - z[0]) / (z[1] - z[0]))
+    assert crossing(x, share + 0.9, error, 0.9, 400) is None and crossing(x, share * 0.5, error, 0.9, 400) is None
+
+
+def test_jitter_is_that_of_a_normal_law_without_what_pixels_have_of_their_own():
+    """Differences of successive latencies of a pixel: 4 µs, whatever each pixel's mean is; 99 pairs are too few."""
+    rng = np.random.default_rng(3)
+    times = 500 + 90 * rng.random(400) + 4 * rng.standard_normal((41, 400))
+    told = latency._jitter(times, np.ones(times.shape, bool))
+    apart = np.abs(np.diff(times[:40], axis=0)[::2])
+    assert told["value"] == pytest.approx(np.quantile(apart, 0.6826895) / np.sqrt(2))
+    assert told["value"] == pytest.approx(4, rel=0.05) and told["standard_error"] < 0.3
+    answered = np.zeros(times.shape, bool)
+    answered[:2, :99] = True
+    assert "99 pairs" in latency._jitter(times, answered)["reason"]
+    answered[2:4, :1] = True
+    assert latency._jitter(times, answered)["value"] is not None
+    assert "two are needed" in latency._jitter(times[:1], np.ones((1, 400), bool))["reason"]
+
+
+def entry(value, error):
+    return {"value": value, "standard_error": error}
+
+
+def test_figures_of_emva_1288_that_follow_from_others():
+    """SNR_max = √well; threshold σ_d + 0.5 with the ADC's 1/12 DN² in σ_d; dynamic range of both."""
+    entries = {
+        "full_well_e": entry(12_000.0, 300.0), "temporal_dark_noise_e": entry(1.9, 0.11),
+        "quantum_efficiency": entry(0.61, 0.02), "K": entry(0.21, 0.004),
+    }  # fmt: skip
+    found = emva._of_both(entries, None)
+    assert found["snr_max"]["value"] == pytest.approx(20 * np.log10(np.sqrt(12_000)))
+    assert found["snr_max"]["standard_error"] == pytest.approx(10 / np.log(10) * 300 / 12_000)
+    dark = np.sqrt(1.9**2 + 1 / 12 / 0.21**2)
+    error = 1.9 / dark * 0.11
+    assert (found["threshold_e"]["value"], found["threshold_e"]["standard_error"]) == pytest.approx((dark + 0.5, error))
+    photons = (dark + 0.5) / 0.61
+    relative = np.hypot(error / (dark + 0.5), 0.02 / 0.61)
+    told = found["threshold_photons"]
+    assert (told["value"], told["standard_error"]) == pytest.approx((photons, photons * relative))
+    told = found["dynamic_range"]
+    assert told["value"] == pytest.approx(20 * np.log10(12_000 / (dark + 0.5)))
+    assert told["standard_error"] == pytest.approx(20 / np.log(10) * np.hypot(error / (dark + 0.5), 300 / 12_000))
+    none = {"value": None, "reason": "why"}
+    found = emva._of_both({**entries, "full_well_e": none, "quantum_efficiency": none}, None)
+    assert [found[name]["reason"] for name in ("snr_max", "threshold_photons", "dynamic_range")] == ["why"] * 3
+
+
+def answers_at(lux, share, error):
+    return Answers(lux, 0.5, None, 900, share, error, 30, {}, {}, 40)
+
+
+def test_the_range_is_that_of_both_ends_less_what_chance_finds():
+    """Shares (p − q)/(1 − q) with errors of as much more; 20 log₁₀ of the ratio, errors of both ends."""
+    lux = [1.0, 4.0, 20.0, 90.0, 300.0]
+    shares, chance = [0.5, 0.97, 1.0, 0.98, 0.6], [0.1, 0.05, 0.0, 0.02, 0.2]
+    found = limits.dynamic_range([answers_at(x, s, 0.01) for x, s in zip(lux, shares, strict=True)], chance)
+    own = [(s - q) / (1 - q) for s, q in zip(shares, chance, strict=True)]
+    assert found.share == pytest.approx(own)
+    assert found.error == pytest.approx([0.01 / (1 - q) for q in chance])
+    low = crossing(np.log(lux[:2]), np.array(own[:2]), found.error[:2], 0.9, 1200)
+    high = crossing(-np.log(lux[3:])[::-1], np.array(own[3:])[::-1], found.error[3:][::-1], 0.9, 1200)
+    assert found.least_lux["value"] == pytest.approx(np.exp(low[0]))
+    assert found.most_lux["value"] == pytest.approx(np.exp(-high[0]))
+    decibel = 20 / np.log(10)
+    assert found.range_db["value"] == pytest.approx(decibel * (-high[0] - low[0]))
+    assert found.range_db["standard_error"] == pytest.approx(decibel * np.hypot(low[1], high[1]))
+
+
+def test_a_background_that_doubles_follows_a_weighted_line_of_logarithms():
+    celsius, rate, error = np.array([10.0, 25, 40, 60]), np.array([0.2, 0.5, 1.7, 5.0]), np.array([0.02, 0.1, 0.1, 0.2])
+    every = [
+        Background(5.0, c, 9.0, (entry(r, e), entry(2 * r, e)), 40, None)
+        for c, r, e in zip(celsius, rate, error, strict=True)
+    ]
+    every += [Background(9.0, c, 9.0, (entry(1.0, 0.1),) * 2, 40, None) for c in (20.0, 22.0, None)]
+    told = doubling(every, 0, False)
+    (slope, _), cov = np.polyfit(celsius, np.log(rate), 1, w=rate / error, cov="unscaled")
+    assert told["value"] == pytest.approx(np.log(2) / slope) and told["note"] == "at 5 lx"
+    assert told["standard_error"] == pytest.approx(np.log(2) / slope * np.sqrt(cov[0, 0]) / slope)
+    assert "two at one light" in doubling(every[4:], 0, False)["reason"]
+    flat = [Background(5.0, c, 9.0, (entry(1.0, 0.2),) * 2, 40, None) for c in (10.0, 30.0)]
+    assert "does not grow over 20 °C" in doubling(flat, 0, False)["reason"]
+    assert _rate({"value": 0.0}, 60.0)["upper_limit"] == pytest.approx(3 / 60)
+    assert _rate({"value": 1.0, "interval_95": [-0.2, 2.0]}, 60.0)["interval_95"] == [0.0, 2.0]
+
+
+def test_the_corner_lies_where_the_swing_has_grown_by_the_root_of_two():
+    hz, swing = np.log([1.0, 10.0, 30.0, 100.0]), np.log([0.4, 0.38, 0.5, 0.9])
+    level = np.log(0.4 * np.sqrt(2))
+    part = (level - swing[2]) / (swing[3] - swing[2])
+    assert modulated._corner(hz, swing) == pytest.approx(hz[2] + part * (hz[3] - hz[2]))
+    assert np.isnan(modulated._corner(hz[:3], swing[:3])) and np.isnan(modulated._corner(hz, swing * np.nan))
+    one = SimpleNamespace(depth=0.6)
+    assert modulated._swing(one) == pytest.approx(np.log(1.6 / 0.4))
+
+
+def test_thresholds_by_counts_add_what_the_dead_time_swallows():
+    """A/θ − c events a cycle less 2π² f T (1/√(1 − d²) − 1)/θ²: exact counts give θ back."""
+    theta, constant, dead_us = 0.23, 1.4, 300.0
+    pair = [SimpleNamespace(hz=2.0, depth=d) for d in (0.6, 0.9)]
+    swing = [np.log((1 + d) / (1 - d)) for d in (0.6, 0.9)]
+    lost = [2 * np.pi**2 * 2.0 * 300e-6 * (1 / np.sqrt(1 - d * d) - 1) for d in (0.6, 0.9)]
+    exact = np.array([a / theta - constant - b / theta**2 for a, b in zip(swing, lost, strict=True)])
+    parts = exact[:, None] * (1 + 0.01 * np.random.default_rng(5).standard_normal((2, 21)))
+    parts[:, 0] = exact
+    told = modulated._slope(pair, parts, dead_us)
+    assert told["value"] == pytest.approx(theta)
+
+    def solved(k):
+        more, a, b = parts[1, k] - parts[0, k], swing[1] - swing[0], lost[1] - lost[0]
+        return np.roots([more, -a, b]).max()
+
+    each = np.array([solved(k) for k in range(1, 21)])
+    assert told["standard_error"] == pytest.approx(np.sqrt(19 / 20 * np.sum((each - each.mean()) ** 2)))
+    assert "swallows" in modulated._slope(pair, parts, 4000.0)["reason"]
+    assert "no more events" in modulated._slope(pair, parts[::-1], dead_us)["reason"]
+
+
+def test_the_widths_of_an_s_curve_and_their_errors_are_those_of_the_logarithms(monkeypatch):
+    """θ, ln √(σ² + τ²), ln σ/τ and logit q: τ = width/√(1 + r²), σ = r τ."""
+    values = np.array([0.21, np.log(0.05), np.log(0.7), special.logit(0.03)])
+    theta, sigma, tau, chance = s_curves._natural(values)
+    assert np.hypot(sigma, tau) == pytest.approx(0.05) and sigma / tau == pytest.approx(0.7)
+    assert (theta, chance) == pytest.approx((0.21, 0.03))
+    root = np.random.default_rng(6).standard_normal((4, 4)) * np.array([1e-3, 0.02, 0.05, 0.1])
+    covariance = root.T @ root
+    slopes = {}
+    for name, k in (("sigma", 1), ("tau", 2)):
+        steps = 1e-5 * np.eye(4)
+        parts = [np.log(s_curves._natural(values + d)[k]) - np.log(s_curves._natural(values - d)[k]) for d in steps]
+        slopes[name] = np.array(parts) / 2e-5
+    fit = SimpleNamespace(values=lambda: (values, covariance), total=lambda _: 0.0)
+    monkeypatch.setattr(s_curves, "_Fit", lambda *_: fit)
+    monkeypatch.setattr(s_curves, "_problem", lambda *_: "")
+    some = SimpleNamespace(size=0.2, of=lambda polarity: np.ones((7, 30)), steps=SimpleNamespace(lux=5.0))
+    for polarity, sign in ((0, 1), (1, -1)):
+        entries = s_curves.s_curve([some], polarity, np.ones(30, bool)).entries
+        told = entries["threshold_spread"]
+        error = np.sqrt(slopes["tau"] @ covariance @ slopes["tau"])
+        assert told["value"] == pytest.approx(100 * tau / 0.21) and told["unit"] == "%"
+        assert told["standard_error"] == pytest.approx(told["value"] * error, rel=1e-4)
+        told = entries["pixel_noise"]
+        error = np.sqrt(slopes["sigma"] @ covariance @ slopes["sigma"])
+        assert told["standard_error"] == pytest.approx(sigma * error, rel=1e-4)
+        told = entries["contrast_sensitivity"]
+        assert told["value"] == pytest.approx(100 * sign * (np.exp(sign * 0.21) - 1))
+        assert told["standard_error"] == pytest.approx(100 * np.exp(sign * 0.21) * np.sqrt(covariance[0, 0]))
+        assert entries["threshold"]["standard_error"] == pytest.approx(np.sqrt(covariance[0, 0]))
