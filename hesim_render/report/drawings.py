@@ -22,7 +22,7 @@ Draw = Callable[["Axes"], None]
 #: Colours of ON and OFF.
 _ON_OFF = (COLOURS[1], COLOURS[0])
 #: Axes of a smaller range have numbers between powers of ten.
-_FEW_DECADES = 100.0
+_FEW_DECADES, _ONE_DECADE = 100.0, 10.0
 #: Height of axes over that of their data, where a legend stands above these.
 _LEGEND_ROOM = 1.35
 #: Intervals are drawn up to here, µs.
@@ -64,7 +64,7 @@ def _logarithmic(axes: Axes, *which: str) -> None:
         axis.set_major_formatter(tick_text)
         low, high = axis.get_view_interval()
         if high < _FEW_DECADES * low:
-            axis.set_minor_locator(LogLocator(subs=(2, 5)))
+            axis.set_minor_locator(LogLocator(subs=(2, 5) if high > _ONE_DECADE * low else (2, 3, 4, 5, 7)))
             axis.set_minor_formatter(tick_text)
         else:
             axis.set_minor_formatter("")
