@@ -8,7 +8,7 @@ import yaml
 from scipy.stats import chi2, norm
 
 from hesim_render.calibrate.aps import checks, composite, dark, sensor_file, telegraph
-from hesim_render.calibrate.finding import ALARM
+from hesim_render.calibrate.estimate import ALARM
 
 
 def test_lines_of_pixels_that_lack_exposures_are_those_of_polyfit():

@@ -8,7 +8,7 @@ from scipy import special
 from scipy.stats import norm
 
 from hesim_render.report import emva, latency, limits, modulated, s_curves
-from hesim_render.report.estimates import crossing, log_estimated, mean_error, quantile, whole_us
+from hesim_render.report.estimates import crossing, log_estimated, mean_error, quantile, whole_us_quantile
 from hesim_render.report.latency import Answers
 from hesim_render.report.steady import Background, _rate, doubling
 
@@ -42,10 +42,10 @@ def test_a_quantile_has_the_interval_of_the_share_below_it():
     assert value == pytest.approx(np.quantile(values, 0.3)) and share == pytest.approx(np.sqrt(0.21 / 1000), rel=0.6)
     ends = [np.quantile(values, 0.3 + z * share) for z in (-Z, Z)]
     assert (low, high) == pytest.approx(ends) and error == pytest.approx((ends[1] - ends[0]) / (2 * Z))
-    told = whole_us((40.0, 3.0, 34.0, 47.0), 0.7)
+    told = whole_us_quantile((40.0, 3.0, 34.0, 47.0), 0.7)
     assert told["value"] == pytest.approx(28) and told["interval_95"] == pytest.approx([0.7 * 33.5, 0.7 * 47.5])
     assert told["standard_error"] == pytest.approx(0.7 * np.sqrt(9 + 1 / 12))
-    assert whole_us((0.2, 0.1, 0.1, 0.3))["interval_95"][0] == 0
+    assert whole_us_quantile((0.2, 0.1, 0.1, 0.3))["interval_95"][0] == 0
     told = log_estimated(np.log(5.0), 0.2, "lx")
     assert told["value"] == pytest.approx(5) and told["standard_error"] == pytest.approx(1.0)
     assert told["interval_95"] == pytest.approx([5 * np.exp(-0.2 * Z), 5 * np.exp(0.2 * Z)])
@@ -209,7 +209,7 @@ def test_the_widths_of_an_s_curve_and_their_errors_are_those_of_the_logarithms(m
     some = SimpleNamespace(size=0.2, of=lambda polarity: np.ones((7, 30)), steps=SimpleNamespace(lux=5.0))
     for polarity, sign in ((0, 1), (1, -1)):
         entries = s_curves.s_curve([some], polarity, np.ones(30, bool)).entries
-        told = entries["threshold_spread"]
+        told = entries["threshold_spread_percent"]
         error = np.sqrt(slopes["tau"] @ covariance @ slopes["tau"])
         assert told["value"] == pytest.approx(100 * tau / 0.21) and told["unit"] == "%"
         assert told["standard_error"] == pytest.approx(told["value"] * error, rel=1e-4)

@@ -15,7 +15,6 @@ from hesim_render.sources.render.audit import audit as audit_module
 from hesim_render.sources.render.audit.audit import STRETCHES, Audit
 from hesim_render.sources.render.audit.compare import Tally, compare_crossings, compare_ticks
 from hesim_render.sources.render.audit.confidence import lower_bound, ratio_upper_bound, upper_bound
-from hesim_render.sources.render.audit.tally import Tally
 from hesim_render.sources.render.audit.units import NotedFlux
 
 ROWS, COLS, TICKS, TICK_US = 24, 32, 120, 1000
