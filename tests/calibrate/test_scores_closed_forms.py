@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
-from hesim_render.calibrate.evs import analysis, defects, fit, goodness
+from hesim_render.calibrate.evs import analysis, checks, defects, fit, goodness
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_likelihood, log_probability
 from hesim_render.calibrate.flicker import unsteady
@@ -223,3 +223,14 @@ def test_bad_pixels_are_compared_with_good_ones_of_their_brightness():
     np.testing.assert_allclose(mean[1], [7e-3, 7e-3, 2e-3], rtol=1e-9)
     dark = np.sort(np.append(np.full(198, 10), 25))
     assert limit[0, 0] == pytest.approx(np.quantile(dark, 0.999), rel=0.02) and limit[0, 2] == 30
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "is_told"), [(0.98, 0.004, True), (0.98, 0.006, False), (1.01, 1e-4, False)]
+)
+def test_a_ceiling_below_1_is_told_beyond_its_error(value, error, is_told):
+    """Five errors below are beyond a chance of 1e-4, three and a third are not."""
+    found = checks._ceiling(SimpleNamespace(ceiling=(value, error)))
+    assert (found is not None) is is_told
+    if is_told:
+        assert found.p_value == pytest.approx(norm.sf(0.02 / error))

@@ -17,6 +17,7 @@ from hesim_render import cli
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
 from hesim_render.core import output
 from hesim_render.core.errors import OutputError, SpecError
+from hesim_render.core.hdf5 import Disk
 from hesim_render.core.output import OutputFolder, check_target, discard_unfinished, output_errors, replacing
 
 KILLED = Path(__file__).parents[1] / "robustness" / "killed.py"
@@ -376,3 +377,13 @@ def test_an_error_names_the_place_that_a_file_was_to_have(tmp_path):
     with pytest.raises(OutputError, match=told), replacing(folder.path / "results.csv"):
         raise OSError(27, "File too large")
     folder.discard()
+
+
+def test_what_lies_behind_the_end_of_a_file_is_read_as_zeros(tmp_path):
+    """HDF5 asks for more than there is after an error, which it must not see."""
+    disk = Disk(tmp_path / "f")
+    disk.write(b"abcde")
+    disk.seek(2)
+    found = bytearray(b"x" * 7)
+    assert disk.readinto(found) == 7 and bytes(found) == b"cde" + bytes(4)
+    disk.close()

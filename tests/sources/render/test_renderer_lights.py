@@ -8,7 +8,12 @@ from scipy import integrate
 import hesim_render as hr
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render import render_cube
-from hesim_render.sources.render.scene.lights import area_light_frame, form_factor_integral, irradiance
+from hesim_render.sources.render.scene.lights import (
+    area_light_frame,
+    form_factor_integral,
+    geometry_on_plane,
+    irradiance,
+)
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba, spectrum_dict
 from hesim_render.specs.scene import LightSpec
 from hesim_render.spectral.spectrum import Spectrum, summed
@@ -47,6 +52,17 @@ def test_polygon_form_factor_equals_quadrature_over_the_light():
         expected, _ = integrate.dblquad(integrand, -1, 1, -1, 1, epsabs=1e-10)
         corners = frame[:3, 3] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ frame[:3, :2].T
         np.testing.assert_allclose(form_factor_integral(corners, point, normal), expected, rtol=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["point", "directional"])
+def test_lights_of_unit_strength_on_a_plane_that_is_nowhere_near_the_origin(kind):
+    """cos θ/d² of a point, cos θ of a beam, at (0.1, −0.2, 0.05) with a tilted normal."""
+    normal = np.array([0.2, 0.5, 0.9])
+    plane = {"plane_point_m": (0.1, -0.2, 0.05), "plane_normal": tuple(normal)}
+    away = np.array([0.4 - 0.1, 0.3 + 0.2, 0.5 - 0.05]) if kind == "point" else np.array([-1, 2, 1.5])
+    cosine = away @ normal / np.linalg.norm(away) / np.linalg.norm(normal)
+    found = geometry_on_plane(LightSpec.model_validate(LIGHTS[kind] | plane), "light")
+    assert found == pytest.approx(cosine / (away @ away) if kind == "point" else cosine)
 
 
 def test_polygon_below_the_horizon_does_not_count():
