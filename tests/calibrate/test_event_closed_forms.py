@@ -216,7 +216,7 @@ def test_pooled_s_curves_have_the_moments_of_their_law():
 def test_middle_spread_and_leak_of_a_start():
     """Quartiles of a normal law are 1.349 deviations apart; half an event is added to those of the brightest light."""
     values = 3.0 + 0.4 * norm.ppf((np.arange(4001) + 0.5) / 4001)
-    assert trials_fit.middle_and_spread(values) == pytest.approx((3.0, 0.4 / 3.0), rel=1e-3)
+    assert trials_fit.median_and_spread(values) == pytest.approx((3.0, 0.4 / 3.0), rel=1e-3)
     steady = SimpleNamespace(
         signal_dn=np.array([3.0, 90.0, 20.0]), on=np.array([[[5, 1]], [[7, 4]], [[9, 9]]]),
         calm=np.array([[10, 10], [30, 50], [90, 90]]), edges_s=np.array([0.0, 0.1, 0.25]),
