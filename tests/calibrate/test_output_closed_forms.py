@@ -25,7 +25,8 @@ def calibration(**changed):
     spatial_lit = SpatialVariance(0.9, 2.4, 6.1, (0.05, 0.07, 0.9), (13, 21, 273))
     mean = np.full((14, 22), 40.0)
     given = {
-        "pairs": SimpleNamespace(has_photons=True, shape=(14, 22), is_dark_once=False, long=[0]), "dark_noise_is_rounded_off": False,
+        "pairs": SimpleNamespace(has_photons=True, shape=(14, 22), is_dark_once=False, long=[0]),
+        "dark_noise_is_rounded_off": False,
         "gain": SimpleNamespace(slope=K, error=K * RELATIVE, groups=9),
         "responsivity": SimpleNamespace(slope=0.22, error=0.0031, groups=9),
         "noise": SimpleNamespace(value=8.9, error=0.23, slope=61.0, groups=7),
