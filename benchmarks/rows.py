@@ -51,10 +51,10 @@ def simulate(scene, sensor, seconds, *more):
 
 
 def forecast(row):
-    """Million rays of picture and pilot by the estimate before a run, or None."""
+    """Million rays of picture and pilot by the estimate before a run."""
     result = subprocess.run(simulate(*row, "--dry-run"), capture_output=True, text=True, check=True)
     rays = re.search(r"(\d+) million rays", result.stdout + result.stderr)
-    return None if rays is None else int(rays.group(1))
+    return int(rays.group(1)) if rays else 0
 
 
 def run(name, row, folder):
