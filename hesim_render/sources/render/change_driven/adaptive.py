@@ -105,13 +105,12 @@ class AdaptiveRenderer:
         self.counts.pilot_rays += self.tracer.rays_done - before
         return piloted
 
-    def pilot_rays(self, band: Band, windows: Windows) -> Anchored:
-        """Pilot of a band in the only window, with its rays."""
+    def pilot_rays(self, band: Band, windows: Windows, near_us: tuple[float, float] | None) -> Anchored:
+        """Pilot of a band in the only window, with its rays, which say what comes near in an interval, µs."""
         before, sites = self.tracer.rays_done, band.sites
         first = np.zeros(sites.size, np.int64)
-        anchored = Anchored(
-            *self.tracer.pilot_rays(sites.index, first, windows, band.pilot_rays, self._footprint_px(band))
-        )
+        given = sites.index, first, windows, band.pilot_rays, self._footprint_px(band), near_us
+        anchored = Anchored(*self.tracer.pilot_rays(*given), windows.span_us, near_us)
         self.counts.pilot_rays += self.tracer.rays_done - before
         return anchored
 

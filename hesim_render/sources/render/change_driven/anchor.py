@@ -40,6 +40,7 @@ class Anchor:
     renderer, band : renders these pixels.
     span_us : begin and end of the anchor, µs.
     flux : [1, n], flux of the pixels there, where it is known already.
+    near_us : interval in which the pilot tells what comes near, µs; that of a block which begins with the anchor.
 
     Attributes
     ----------
@@ -48,11 +49,16 @@ class Anchor:
     """
 
     def __init__(
-        self, renderer: AdaptiveRenderer, band: Band, span_us: tuple[float, float], flux: Flux | None = None
+        self,
+        renderer: AdaptiveRenderer,
+        band: Band,
+        span_us: tuple[float, float],
+        flux: Flux | None = None,
+        near_us: tuple[float, float] | None = None,
     ) -> None:
         self.span_us, self._renderer, self._band = span_us, renderer, band
         self._windows = Windows(*(np.array([time]) for time in span_us))
-        self.pilot = renderer.pilot_rays(band, self._windows)
+        self.pilot = renderer.pilot_rays(band, self._windows, near_us)
         count = band.place.size
         self._flux, self._is_known = Flux.zeros(1, count) if flux is None else flux, np.full(count, flux is not None)
         self._plan: Plan | None = None
@@ -93,7 +99,7 @@ class Anchor:
                 then = renderer.tracer.trace(*of, signed=True).at(np.searchsorted(pixel, place))
                 base = first.at(place)
             else:
-                then, base = self._means_of(place, rays, controlled), self._flux_of(place)
+                then, base = self._means_of(place, rays, controlled), self.flux_of(place)
             # the flux of the window that was compared with, and the difference of the same rays, for each half apart
             halves = [
                 own[0] + (new - old)
@@ -129,7 +135,7 @@ class Anchor:
             self._plan = renderer.plan(pilot, band, is_knot=True)
         return self._plan
 
-    def _flux_of(self, place: NDArray[np.int64]) -> Flux:
+    def flux_of(self, place: NDArray[np.int64]) -> Flux:
         """Flux of some pixels in the anchor, [1, n]."""
         new = np.zeros(self._band.place.size, np.bool_)
         new[place] = True

@@ -50,7 +50,8 @@ class Blocks:
         self.alive = np.flatnonzero(~renderer.still("events").known[pixel])
         self._bands = list(renderer.bands(pixel[self.alive], "events"))
         known = self.base.at(self.alive)
-        self._anchors = [Anchor(renderer, band, span_us, known.at(band.place)) for band in self._bands]
+        near_us = Windows(first.begin_us, first.end_us).span_us
+        self._anchors = [Anchor(renderer, band, span_us, known.at(band.place), near_us) for band in self._bands]
         #: Window whose flux is `_last`.
         self._time: tuple[float, float] | None = None
         self._last = known
@@ -67,7 +68,7 @@ class Blocks:
         for number, band in enumerate(self._bands):
             # a new anchor every 64 ms; the old one is no longer compared with
             if self._anchors[number].span_us != span_us:
-                self._anchors[number] = Anchor(renderer, band, span_us)
+                self._anchors[number] = Anchor(renderer, band, span_us, near_us=windows.span_us)
             anchor = self._anchors[number]
             first = self._last.at(band.place) if is_next else None
             if first is not None and windows.size == 1:
@@ -78,6 +79,8 @@ class Blocks:
             # what lies behind the last wanted window, at the end of a run, is not rendered
             what = renderer.plan(pilot, band, is_knot=True).until(int(np.flatnonzero(block.wanted)[-1]))
             numbers = np.repeat(np.arange(windows.size)[:, None], band.place.size, axis=1)
+            if first is None and anchor.span_us == (block.begin_us[0], block.end_us[0]):
+                first = anchor.flux_of(np.arange(band.place.size))
             if first is None:
                 # by itself, so that the other windows are traced by the calls of a run that comes from the block before
                 first = renderer.render(band, windows, numbers[:1], what.first())[0]

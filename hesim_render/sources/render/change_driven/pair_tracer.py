@@ -99,6 +99,7 @@ class PairTracer(PacketTracer):
         aims: PairAims | None = None,
         before: tuple[PilotRays, NDArray[np.integer]] | None = None,
         kept: NDArray[np.float32] | None = None,
+        repeat: int = 0,
     ) -> PilotFlux:
         """Statistics of a few rays of every listed pair, with random numbers of their own.
 
@@ -114,6 +115,7 @@ class PairTracer(PacketTracer):
             statistics then include the differences.
         kept : [2, n · samples], where the fluxes of single rays are put, by both estimators, e⁻/s on the optical axis.
             They are large, so the journal keeps nothing of such a pass.
+        repeat : number of the set of random numbers.
 
         Returns
         -------
@@ -127,7 +129,7 @@ class PairTracer(PacketTracer):
         room = max(1, self._block_rays // samples)
         for first in range(0, count, room):
             part = slice(first, min(count, first + room))
-            lanes = pixel[part], window[part].astype(np.uint32), np.zeros(part.stop - first, np.uint32)
+            lanes = pixel[part], window[part].astype(np.uint32), np.full(part.stop - first, repeat, np.uint32)
             aimed = None if aims is None else aims.part(part)
             compared = None if before is None else (before[0], before[1][part])
             others = () if compared is None else (compared[0].spans_us, compared[1])

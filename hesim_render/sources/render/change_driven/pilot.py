@@ -25,6 +25,9 @@ from hesim_render.sources.render.change_driven.windows import Windows
 
 #: Relative differences of fluxes that rounding explains, and differences over the wanted error that count as none.
 _ROUNDING, _SAME = np.float32(1e-5), np.float32(0.2)
+#: Rays that tell whether a pixel without neighbours shows anything new, and the width of the area in which they start,
+#: px; sets of such rays between which windows take turns; and how many times fewer they must be than pilot rays.
+DETECTOR_RAYS, DETECTOR_PX, _SETS, _DETECTED = 8, 2.25, 2, 4
 #: Scale of fluxes before they are squared, so that float32 can hold the squares.
 _SMALLER = np.float32(1e-4)
 
@@ -54,10 +57,14 @@ class Anchored:
     ----------
     flux : its statistics, [site].
     rays : its rays.
+    window_us : begin and end of the anchor, µs.
+    near_us : interval for which `flux.met` holds, µs; None: that of the anchor.
     """
 
     flux: PilotFlux
     rays: PilotRays
+    window_us: tuple[float, float]
+    near_us: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -159,6 +166,9 @@ def take_pilot(
     own_rays: PilotRays | None = None
     if anchored is None:
         first = tracer.pilot(sites.index, numbers[0], *given, span_us=span_us)
+    elif anchored.near_us == span_us and _is_window(anchored.window_us, windows, numbers[0]):
+        # the first window is the anchor itself, whose rays are known
+        first, own_rays = anchored.flux, anchored.rays
     else:
         before = anchored.rays, every
         first, own_rays = tracer.pilot_rays(sites.index, numbers[0], *given, span_us=span_us, before=before)
@@ -185,7 +195,13 @@ def take_pilot(
                 values[window, place] = values_there
 
         looks = np.append(np.arange(0, count - 1, stride), count - 1)
-        look(np.repeat(looks[1:], moving.size), np.tile(moving, looks.size - 1))
+        if stride == 1 and rays >= _DETECTED * DETECTOR_RAYS and count > 2 and wanted is not None:
+            # few rays tell which windows show anything new; the last one is the first of the next block
+            busy = _changing(tracer, sites, windows, numbers, pilot, moving, wanted)
+            look(*busy)
+            look(np.full(moving.size, count - 1), moving)
+        else:
+            look(np.repeat(looks[1:], moving.size), np.tile(moving, looks.size - 1))
         spans = [span for span in pairwise(looks.tolist()) if span[1] - span[0] > 1]
         while spans:
             windows_of, places_of = [], []
@@ -221,6 +237,64 @@ def take_pilot(
     aims = Aims.of([(window, *one.aims) for window, one in near_by if one.aims is not None], sites.size)
     refined = _refine(tracer, sites, windows, numbers, pilot, width_px, near_by, aims)
     return replace(pilot, refined=refined, aims=aims, change=change, all_move=tracer.camera is not None), near
+
+
+def _is_window(span_us: tuple[float, float], windows: Windows, numbers: NDArray[np.int64]) -> bool:
+    """True if all sites have one window, which is this one."""
+    one = numbers[0]
+    return bool(np.all(numbers == one)) and span_us == (float(windows.begin_us[one]), float(windows.end_us[one]))
+
+
+def _changing(
+    tracer: PairTracer,
+    sites: Sites,
+    windows: Windows,
+    numbers: NDArray[np.int64],
+    pilot: Pilot,
+    moving: NDArray[np.int64],
+    wanted: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Windows between the first and the last in which a site shows something else than in the first one, by few rays.
+
+    Windows take turns between sets of rays, each of which is compared with the same rays in the first window. A window
+    counts if it, or the one before or after it, differs.
+
+    Parameters
+    ----------
+    pilot : statistics of the first window, in all windows.
+    moving : [m], places of the sites that are looked at.
+    wanted : maps the flux of each site to the wanted error of a pair, both e⁻/s.
+
+    Returns
+    -------
+    window, place : [k] each, in order of windows.
+    """
+    count, size, index = numbers.shape[0], moving.size, sites.index[moving]
+    # the estimator with less scatter in the first window decides in all of them
+    is_controlled = (pilot.controlled_scatter[0] <= pilot.plain_scatter[0])[moving]
+    least = np.maximum(_ROUNDING * np.abs(pilot.flux_of(0)), _SAME * wanted(pilot.flux_of(0)))[moving]
+    differs = np.zeros((count, size), np.bool_)
+    for number in range(_SETS):
+        own = np.arange(1 + number, count - 1, _SETS)
+        if own.size == 0:
+            continue
+        # the first window, and after it those in which these rays are cast
+        every = np.append(0, own)
+        place = np.tile(moving, every.size)
+        seen = tracer.pilot(
+            *(np.tile(index, every.size), numbers[np.repeat(every, size), place], windows, DETECTOR_RAYS),
+            *(DETECTOR_PX, Stream.RENDER_DETECTOR),
+            repeat=number,
+        )
+        controlled, plain = (values.reshape(every.size, size) for values in (seen.controlled, seen.plain))
+        flux = np.where(is_controlled, controlled, plain)
+        differs[own] = np.abs(flux[1:] - flux[0]) > least
+    longer = differs.copy()
+    longer[1:] |= differs[:-1]
+    longer[:-1] |= differs[1:]
+    longer[[0, -1]] = False
+    window, which = np.nonzero(longer)
+    return window, moving[which]
 
 
 def _refine(
