@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from hesim_render.sources.render.change_driven import forecast
+from hesim_render.sources.render.change_driven.allocation import allocate
 from hesim_render.sources.render.change_driven.differences import Differences
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
-from hesim_render.sources.render.change_driven.pilot import Pilot, Refinement, allocate
+from hesim_render.sources.render.change_driven.pilot import Pilot, Refinement
 from hesim_render.sources.render.change_driven.plan import Plan, changes, longer, plan
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain, Tuning
 

@@ -15,6 +15,7 @@ from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Band, Counts, Flux, Still
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites, of_own_row, turns
+from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.pilot import Anchored, Pilot, take_pilot
 from hesim_render.sources.render.change_driven.plan import Plan, plan
@@ -94,13 +95,26 @@ class AdaptiveRenderer:
         span_us: tuple[float, float] | None,
         anchored: Anchored | None = None,
         stride: int = 1,
+        known: PilotFlux | None = None,
     ) -> tuple[Pilot, NDArray[np.bool_]]:
         """Pilot pass of a band in listed windows; see `take_pilot`."""
         before, cols = self.tracer.rays_done, self._sensor.spec.geometry.cols
         width = self._footprint_px(band)
         row, col = np.divmod(band.sites.index.astype(np.int64), cols)
         looks = self.zoom.sites(row, col, windows, numbers)
-        given = self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, looks, anchored, stride
+        given = (
+            self.tracer,
+            band.sites,
+            windows,
+            numbers,
+            band.pilot_rays,
+            width,
+            span_us,
+            looks,
+            anchored,
+            known,
+            stride,
+        )
         piloted = take_pilot(*given, lambda flux: np.float32(band.quality) * band.unit(flux))
         self.counts.pilot_rays += self.tracer.rays_done - before
         return piloted
@@ -217,11 +231,26 @@ class AdaptiveRenderer:
         return about_edges(self.tracer, pairs, *given, self.gain, self.tuning, tried=tried, known=known)
 
     def alone(
-        self, pixel: NDArray[np.uint32], begin: NDArray[np.float64], end: NDArray[np.float64], role: Role, out: Flux
-    ) -> None:
+        self,
+        pixel: NDArray[np.uint32],
+        begin: NDArray[np.float64],
+        end: NDArray[np.float64],
+        role: Role,
+        out: Flux,
+        keep: tuple[float, float] | None = None,
+    ) -> list[tuple[Band, Anchored]]:
         """Put the flux of listed pixels, each in its own window, into `out` [1, n]. Constant pixels are rendered
         once.
+
+        Parameters
+        ----------
+        keep : keep the pilot's rays, where all pixels have one window; with what comes near within an interval, µs.
+
+        Returns
+        -------
+        Bands with their pilots, where these are kept.
         """
+        kept: list[tuple[Band, Anchored]] = []
         self.counts.values += pixel.size
         still = self.still(role)
         known = still.known[pixel]
@@ -236,7 +265,12 @@ class AdaptiveRenderer:
             for band in self.bands(pixel[listed], role):
                 place, own = listed[band.place], window[band.place]
                 numbers = of_own_row(band.sites, own, self._sensor.spec.geometry.cols)[None]
-                pilot, near = self.pilot(band, windows, numbers, still.span_us)
+                own_pilot = None
+                if keep is not None:
+                    # the pilot of constant pixels looks at all times
+                    kept.append((band, self.pilot_rays(band, windows, still.span_us or keep)))
+                    own_pilot = kept[-1][1].flux
+                pilot, near = self.pilot(band, windows, numbers, still.span_us, known=own_pilot)
                 what = self.plan(pilot, band, is_knot=role == "events")
                 flux, met = self.render(band, windows, own[None], what, still.span_us)
                 out.put(place, flux)
@@ -244,3 +278,4 @@ class AdaptiveRenderer:
                     fixed = ~(band.sites.most(near, REACH) | met[0])
                     still.known[pixel[place[fixed]]] = True
                     still.flux.put(pixel[place[fixed]], flux.at(fixed))
+        return kept

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.estimates import Band, Flux
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, not_negative
+from hesim_render.sources.render.change_driven.pilot import Anchored
 from hesim_render.sources.render.change_driven.plan import Plan
 from hesim_render.sources.render.change_driven.windows import Windows
 
@@ -41,6 +42,7 @@ class Anchor:
     span_us : begin and end of the anchor, µs.
     flux : [1, n], flux of the pixels there, where it is known already.
     near_us : interval in which the pilot tells what comes near, µs; that of a block which begins with the anchor.
+    pilot : the pilot, where it is known.
 
     Attributes
     ----------
@@ -55,10 +57,11 @@ class Anchor:
         span_us: tuple[float, float],
         flux: Flux | None = None,
         near_us: tuple[float, float] | None = None,
+        pilot: Anchored | None = None,
     ) -> None:
         self.span_us, self._renderer, self._band = span_us, renderer, band
         self._windows = Windows(*(np.array([time]) for time in span_us))
-        self.pilot = renderer.pilot_rays(band, self._windows, near_us)
+        self.pilot = renderer.pilot_rays(band, self._windows, near_us) if pilot is None else pilot
         count = band.place.size
         self._flux, self._is_known = Flux.zeros(1, count) if flux is None else flux, np.full(count, flux is not None)
         self._plan: Plan | None = None
@@ -131,7 +134,8 @@ class Anchor:
         """How the pixels are rendered in the anchor."""
         if self._plan is None:
             renderer, band = self._renderer, self._band
-            pilot, _ = renderer.pilot(band, self._windows, np.zeros((1, band.sites.size), np.int64), None)
+            first = np.zeros((1, band.sites.size), np.int64)
+            pilot, _ = renderer.pilot(band, self._windows, first, None, known=self.pilot.flux)
             self._plan = renderer.plan(pilot, band, is_knot=True)
         return self._plan
 

@@ -8,6 +8,7 @@ windows.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,14 +45,22 @@ class Blocks:
         span_us = anchor_us(first.begin_us, first.end_us)
         # the anchor of the first window at all pixels: constant pixels keep this flux for the whole run
         begin, end = (np.full(pixel.size, time) for time in span_us)
-        renderer.alone(pixel, begin, end, "events", self.base)
+        near_us = Windows(first.begin_us, first.end_us).span_us
+        kept = renderer.alone(pixel, begin, end, "events", self.base, keep=near_us)
         # values of the anchor are no samples of the sensor
         renderer.counts.values -= pixel.size
         self.alive = np.flatnonzero(~renderer.still("events").known[pixel])
-        self._bands = list(renderer.bands(pixel[self.alive], "events"))
         known = self.base.at(self.alive)
-        near_us = Windows(first.begin_us, first.end_us).span_us
-        self._anchors = [Anchor(renderer, band, span_us, known.at(band.place), near_us) for band in self._bands]
+        if self.alive.size == sum(band.place.size for band, _ in kept):
+            # all pixels may change, so these bands and their pilots go on
+            pilots = [pilot for _, pilot in kept]
+            self._bands = [band for band, _ in kept]
+        else:
+            pilots, self._bands = [], list(renderer.bands(pixel[self.alive], "events"))
+        self._anchors = [
+            Anchor(renderer, band, span_us, known.at(band.place), near_us, pilot)
+            for band, pilot in zip_longest(self._bands, pilots)
+        ]
         #: Window whose flux is `_last`.
         self._time: tuple[float, float] | None = None
         self._last = known

@@ -51,8 +51,10 @@ def forecast(source: ChangeDrivenFlux, demand: Demand) -> Estimate:
         # all pixels are rendered in the first anchor, and in later ones those that are compared with it
         begin_us, end_us = anchor_us(every[0].begin_us, every[0].end_us)
         first = source.foretell(patch, np.array([begin_us]), np.array([end_us]), "events", is_anchor=True)[[0, 3]].sum()
-        # the first window of the first block belongs to no block before it
-        begin = source.foretell(patch, every[-1].begin_us[:1], every[-1].end_us[:1], "events")[0]
+        # the first window of the first block belongs to no block before it, and may be the anchor itself
+        begin = 0.0
+        if (begin_us, end_us) != (every[0].begin_us[0], every[0].end_us[0]):
+            begin = source.foretell(patch, every[0].begin_us[:1], every[0].end_us[:1], "events")[0]
         share = np.mean([np.ptp(block.end_us) / period_us(block.end_us) for block in chosen])
         more_anchors = max(0.0, float(np.ceil(demand.blocks.count * share)) - 1)
         rest = anchors * more_anchors + compared * (1 + more_anchors) + (each + pilots) * demand.blocks.count

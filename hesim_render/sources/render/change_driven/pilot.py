@@ -16,20 +16,18 @@ from numpy.typing import NDArray
 
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.aim import Aims
+from hesim_render.sources.render.change_driven.change_detector import (
+    DETECTOR_RAYS,
+    WORTH,
+    FirstLook,
+    least_change,
+    windows_with_changes,
+)
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux, PilotRays, joined
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.small_objects import Look
-from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
-
-#: Relative differences of fluxes that rounding explains, and differences over the wanted error that count as none.
-_ROUNDING, _SAME = np.float32(1e-5), np.float32(0.2)
-#: Rays that tell whether a pixel without neighbours shows anything new, and the width of the area in which they start,
-#: px; sets of such rays between which windows take turns; and how many times fewer they must be than pilot rays.
-DETECTOR_RAYS, DETECTOR_PX, _SETS, _DETECTED = 8, 2.25, 2, 4
-#: Scale of fluxes before they are squared, so that float32 can hold the squares.
-_SMALLER = np.float32(1e-4)
 
 
 @dataclass(frozen=True)
@@ -58,13 +56,19 @@ class Anchored:
     flux : its statistics, [site].
     rays : its rays.
     window_us : begin and end of the anchor, µs.
-    near_us : interval for which `flux.met` holds, µs; None: that of the anchor.
+    near_us : interval for which `flux.met` holds, or a longer one, µs; None: that of the anchor.
     """
 
     flux: PilotFlux
     rays: PilotRays
     window_us: tuple[float, float]
     near_us: tuple[float, float] | None = None
+
+    def tells(self, span_us: tuple[float, float] | None) -> bool:
+        """True if `flux.met` is True wherever a ray came near a moving object within an interval, µs."""
+        if span_us is None or self.near_us is None:
+            return False
+        return self.near_us[0] <= span_us[0] and span_us[1] <= self.near_us[1]
 
 
 @dataclass(frozen=True)
@@ -139,6 +143,7 @@ def take_pilot(
     span_us: tuple[float, float] | None,
     extra_looks: Sequence[Sequence[Look]] = (),
     anchored: Anchored | None = None,
+    known: PilotFlux | None = None,
     stride: int = 1,
     wanted: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
 ) -> tuple[Pilot, NDArray[np.bool_]]:
@@ -153,6 +158,7 @@ def take_pilot(
     span_us : interval around all windows for which `near` is computed, µs; None: not computed.
     extra_looks : for each window, the sites that get extra rays; see `Zoom`.
     anchored : pilot of the anchor with which the first and the last window are compared; None: nothing is compared.
+    known : results of the first window, where they are known and nothing is compared.
     stride : number of windows from one look to the next; between two looks that show the same, nothing is traced.
     wanted : maps the flux of each site to the wanted error of a pair, both e⁻/s; needed where `stride` is above 1.
 
@@ -164,9 +170,11 @@ def take_pilot(
     """
     count, every, given = numbers.shape[0], np.arange(sites.size), (windows, rays, width_px)
     own_rays: PilotRays | None = None
-    if anchored is None:
+    if known is not None:
+        first = known
+    elif anchored is None:
         first = tracer.pilot(sites.index, numbers[0], *given, span_us=span_us)
-    elif anchored.near_us == span_us and _is_window(anchored.window_us, windows, numbers[0]):
+    elif anchored.tells(span_us) and _is_window(anchored.window_us, windows, numbers[0]):
         # the first window is the anchor itself, whose rays are known
         first, own_rays = anchored.flux, anchored.rays
     else:
@@ -195,10 +203,13 @@ def take_pilot(
                 values[window, place] = values_there
 
         looks = np.append(np.arange(0, count - 1, stride), count - 1)
-        if stride == 1 and rays >= _DETECTED * DETECTOR_RAYS and count > 2 and wanted is not None:
+        if stride == 1 and rays >= WORTH * DETECTOR_RAYS and wanted is not None:
             # few rays tell which windows show anything new; the last one is the first of the next block
-            busy = _changing(tracer, sites, windows, numbers, pilot, moving, wanted)
-            look(*busy)
+            first_look = FirstLook.of(pilot.flux_of(0), first, wanted).at(moving)
+            window, place = windows_with_changes(
+                tracer, sites.index[moving], numbers[:, moving], windows, first_look, width_px
+            )
+            look(window, moving[place])
             look(np.full(moving.size, count - 1), moving)
         else:
             look(np.repeat(looks[1:], moving.size), np.tile(moving, looks.size - 1))
@@ -209,10 +220,7 @@ def take_pilot(
                 # what shows the same in two looks, in all pixels around, has kept its light between them
                 is_controlled = pilot.controlled_scatter[early] <= pilot.plain_scatter[early]
                 begin, end = (np.where(is_controlled, pilot.controlled[k], pilot.plain[k]) for k in (early, late))
-                least = _ROUNDING * np.abs(begin)
-                if wanted is not None:
-                    least = np.maximum(least, _SAME * wanted(begin))
-                changed = np.abs(end - begin) > least
+                changed = np.abs(end - begin) > least_change(begin, wanted)
                 busy = np.flatnonzero(sites.near(changed, REACH - 1) & near)
                 between = slice(early + 1, late)
                 for values in _tables(pilot):
@@ -243,58 +251,6 @@ def _is_window(span_us: tuple[float, float], windows: Windows, numbers: NDArray[
     """True if all sites have one window, which is this one."""
     one = numbers[0]
     return bool(np.all(numbers == one)) and span_us == (float(windows.begin_us[one]), float(windows.end_us[one]))
-
-
-def _changing(
-    tracer: PairTracer,
-    sites: Sites,
-    windows: Windows,
-    numbers: NDArray[np.int64],
-    pilot: Pilot,
-    moving: NDArray[np.int64],
-    wanted: Callable[[NDArray[np.float32]], NDArray[np.float32]],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Windows between the first and the last in which a site shows something else than in the first one, by few rays.
-
-    Windows take turns between sets of rays, each of which is compared with the same rays in the first window. A window
-    counts if it, or the one before or after it, differs.
-
-    Parameters
-    ----------
-    pilot : statistics of the first window, in all windows.
-    moving : [m], places of the sites that are looked at.
-    wanted : maps the flux of each site to the wanted error of a pair, both e⁻/s.
-
-    Returns
-    -------
-    window, place : [k] each, in order of windows.
-    """
-    count, size, index = numbers.shape[0], moving.size, sites.index[moving]
-    # the estimator with less scatter in the first window decides in all of them
-    is_controlled = (pilot.controlled_scatter[0] <= pilot.plain_scatter[0])[moving]
-    least = np.maximum(_ROUNDING * np.abs(pilot.flux_of(0)), _SAME * wanted(pilot.flux_of(0)))[moving]
-    differs = np.zeros((count, size), np.bool_)
-    for number in range(_SETS):
-        own = np.arange(1 + number, count - 1, _SETS)
-        if own.size == 0:
-            continue
-        # the first window, and after it those in which these rays are cast
-        every = np.append(0, own)
-        place = np.tile(moving, every.size)
-        seen = tracer.pilot(
-            *(np.tile(index, every.size), numbers[np.repeat(every, size), place], windows, DETECTOR_RAYS),
-            *(DETECTOR_PX, Stream.RENDER_DETECTOR),
-            repeat=number,
-        )
-        controlled, plain = (values.reshape(every.size, size) for values in (seen.controlled, seen.plain))
-        flux = np.where(is_controlled, controlled, plain)
-        differs[own] = np.abs(flux[1:] - flux[0]) > least
-    longer = differs.copy()
-    longer[1:] |= differs[:-1]
-    longer[:-1] |= differs[1:]
-    longer[[0, -1]] = False
-    window, which = np.nonzero(longer)
-    return window, moving[which]
 
 
 def _refine(
@@ -349,73 +305,3 @@ def _tables(statistics: Pilot | PilotFlux) -> tuple[NDArray[np.float32], ...]:
         statistics.plain_scatter,
         statistics.unshadowed,
     )
-
-
-def allocate(
-    pilot: Pilot,
-    window: int,
-    sites: Sites,
-    units: NDArray[np.float32],
-    quality: float,
-    gain: Gain,
-    tuning: Tuning,
-    is_knot: bool,
-) -> tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.float32], NDArray[np.int16]]:
-    """Allocate rays to each listed pixel in one window.
-
-    Parameters
-    ----------
-    pilot, window, sites : statistics of the pilot, number of the window, and pixels with neighbours.
-    units : [window, site], noise units, e⁻/s.
-    quality : wanted error in noise units.
-    gain : error law of stratified rays.
-    tuning : constants.
-    is_knot : True if the window is the first or the last of its block. It then belongs to two blocks, and the windows
-        beside it must not influence it.
-
-    Returns
-    -------
-    rays, controlled, error, floor : [n] each: number of rays, choice of the estimator with a control variate, expected
-        error, and number of rays that knowledge of an edge does not lower; see `Plan`.
-    """
-    low, high = (window, window + 1) if is_knot else (max(0, window - 1), window + 2)
-    flux, here = pilot.flux_of(window), sites.listed
-    own, value = units[window][here], flux[here]
-    squares = []
-    for table in (pilot.controlled_scatter, pilot.plain_scatter):
-        square = (table[window] * _SMALLER) ** 2
-        squares.append(np.float32(0.5) * (square[here] + sites.mean(square)))
-    if pilot.refined:
-        refined = pilot.refined[window]
-        for square, scatter_there in zip(squares, (refined.controlled_scatter, refined.plain_scatter), strict=True):
-            seen = np.zeros(sites.size, np.float32)
-            seen[refined.place] = (scatter_there * _SMALLER) ** 2
-            np.maximum(square, seen[here], out=square)
-    open_flux = pilot.unshadowed[window]
-    controlled = (squares[0] <= squares[1]) & (2 * value >= open_flux[here])
-    scatter = np.sqrt(np.where(controlled, *squares)) / _SMALLER
-    # an edge in a neighbour may reach into this pixel between the pilot rays
-    around = np.stack([pilot.flux_of(number) for number in range(low, min(high, units.shape[0]))])
-    highest, lowest = around.max(axis=0), around.min(axis=0)
-    contrast = np.maximum(sites.most(highest, 1) - value, value + sites.most(-lowest, 1))
-    unseen = np.float32(tuning.unseen_area**0.5) * contrast
-    # if a neighbour sees light that is hidden here, part of it may be visible here too
-    is_light_near = sites.most(flux > np.float32(1e-6) * open_flux, REACH)
-    brighter = np.maximum(sites.most(highest, 2) - value, np.where(is_light_near, open_flux[here] - value, 0))
-    wanted_error = np.float32(quality) * own
-    for_unseen = np.maximum(gain.rays(unseen / wanted_error), np.float32(tuning.bright_rays) * brighter / own)
-    wanted = gain.rays(scatter / wanted_error) * np.float32(tuning.knot_factor if is_knot else 1.0)
-    wanted = np.maximum(wanted, np.minimum(for_unseen, np.float32(tuning.most_unseen_rays)))
-    looked = None
-    if pilot.refined:
-        # With fewer rays than the closer look, a single ray could hit the small object and weigh far too much.
-        looked = np.zeros(sites.size, np.float32)
-        np.maximum.at(looked, pilot.refined[window].place, pilot.refined[window].rays.astype(np.float32))
-        wanted = np.maximum(wanted, looked[here])
-    heavy = np.float32(tuning.ray_weight) * wanted_error
-    wanted = np.maximum(wanted, open_flux[here] / heavy)
-    # light that is hidden from all pilot rays may still come through a gap
-    floor = np.maximum(np.zeros_like(value) if looked is None else looked[here], (open_flux[here] - value) / heavy)
-    bits = np.rint(np.log2(np.clip(wanted, tuning.least_rays, tuning.most_rays))).astype(np.int16)
-    rays = np.left_shift(np.int16(1), bits)
-    return rays, controlled, gain.error(scatter, rays), np.clip(floor, 0, tuning.most_rays).astype(np.int16)

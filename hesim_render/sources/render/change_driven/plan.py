@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.sources.render.change_driven.aim import Aims
+from hesim_render.sources.render.change_driven.allocation import allocate
 from hesim_render.sources.render.change_driven.differences import Differences, differences
 from hesim_render.sources.render.change_driven.edge_courses import fitted_windows
 from hesim_render.sources.render.change_driven.error_target import NoiseUnit
 from hesim_render.sources.render.change_driven.neighbours import Sites
-from hesim_render.sources.render.change_driven.pilot import Pilot, allocate
+from hesim_render.sources.render.change_driven.pilot import Pilot
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 
 

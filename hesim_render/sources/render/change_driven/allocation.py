@@ -1,0 +1,83 @@
+"""Rays of each pair, from what the pilot saw of the pixel and of its neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
+from hesim_render.sources.render.change_driven.pilot import Pilot
+from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
+
+#: Scale of fluxes before they are squared, so that float32 can hold the squares.
+_SMALLER = np.float32(1e-4)
+
+
+def allocate(
+    pilot: Pilot,
+    window: int,
+    sites: Sites,
+    units: NDArray[np.float32],
+    quality: float,
+    gain: Gain,
+    tuning: Tuning,
+    is_knot: bool,
+) -> tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.float32], NDArray[np.int16]]:
+    """Allocate rays to each listed pixel in one window.
+
+    Parameters
+    ----------
+    pilot, window, sites : statistics of the pilot, number of the window, and pixels with neighbours.
+    units : [window, site], noise units, e⁻/s.
+    quality : wanted error in noise units.
+    gain : error law of stratified rays.
+    tuning : constants.
+    is_knot : True if the window is the first or the last of its block. It then belongs to two blocks, and the windows
+        beside it must not influence it.
+
+    Returns
+    -------
+    rays, controlled, error, floor : [n] each: number of rays, choice of the estimator with a control variate, expected
+        error, and number of rays that knowledge of an edge does not lower; see `Plan`.
+    """
+    low, high = (window, window + 1) if is_knot else (max(0, window - 1), window + 2)
+    flux, here = pilot.flux_of(window), sites.listed
+    own, value = units[window][here], flux[here]
+    squares = []
+    for table in (pilot.controlled_scatter, pilot.plain_scatter):
+        square = (table[window] * _SMALLER) ** 2
+        squares.append(np.float32(0.5) * (square[here] + sites.mean(square)))
+    if pilot.refined:
+        refined = pilot.refined[window]
+        for square, scatter_there in zip(squares, (refined.controlled_scatter, refined.plain_scatter), strict=True):
+            seen = np.zeros(sites.size, np.float32)
+            seen[refined.place] = (scatter_there * _SMALLER) ** 2
+            np.maximum(square, seen[here], out=square)
+    open_flux = pilot.unshadowed[window]
+    controlled = (squares[0] <= squares[1]) & (2 * value >= open_flux[here])
+    scatter = np.sqrt(np.where(controlled, *squares)) / _SMALLER
+    # an edge in a neighbour may reach into this pixel between the pilot rays
+    around = np.stack([pilot.flux_of(number) for number in range(low, min(high, units.shape[0]))])
+    highest, lowest = around.max(axis=0), around.min(axis=0)
+    contrast = np.maximum(sites.most(highest, 1) - value, value + sites.most(-lowest, 1))
+    unseen = np.float32(tuning.unseen_area**0.5) * contrast
+    # if a neighbour sees light that is hidden here, part of it may be visible here too
+    is_light_near = sites.most(flux > np.float32(1e-6) * open_flux, REACH)
+    brighter = np.maximum(sites.most(highest, 2) - value, np.where(is_light_near, open_flux[here] - value, 0))
+    wanted_error = np.float32(quality) * own
+    for_unseen = np.maximum(gain.rays(unseen / wanted_error), np.float32(tuning.bright_rays) * brighter / own)
+    wanted = gain.rays(scatter / wanted_error) * np.float32(tuning.knot_factor if is_knot else 1.0)
+    wanted = np.maximum(wanted, np.minimum(for_unseen, np.float32(tuning.most_unseen_rays)))
+    looked = None
+    if pilot.refined:
+        # With fewer rays than the closer look, a single ray could hit the small object and weigh far too much.
+        looked = np.zeros(sites.size, np.float32)
+        np.maximum.at(looked, pilot.refined[window].place, pilot.refined[window].rays.astype(np.float32))
+        wanted = np.maximum(wanted, looked[here])
+    heavy = np.float32(tuning.ray_weight) * wanted_error
+    wanted = np.maximum(wanted, open_flux[here] / heavy)
+    # light that is hidden from all pilot rays may still come through a gap
+    floor = np.maximum(np.zeros_like(value) if looked is None else looked[here], (open_flux[here] - value) / heavy)
+    bits = np.rint(np.log2(np.clip(wanted, tuning.least_rays, tuning.most_rays))).astype(np.int16)
+    rays = np.left_shift(np.int16(1), bits)
+    return rays, controlled, gain.error(scatter, rays), np.clip(floor, 0, tuning.most_rays).astype(np.int16)
