@@ -91,8 +91,11 @@ class Tuning:
         line that only just enters a pixel, or passes beside it, is not seen.
     edge_contrast_rays : rays per wanted error, F. Rays of a pair with a line for each wanted error of contrast between
         its sides; from the star alone. Without (0): what the decision rays missed makes single values that are far off.
-    flat_contrast : wanted errors, C. Where decision rays find less contrast, and no line, a pair gets the rays that
-        their scatter asks for. Without (0): pixels beside an edge take the rays that its contrast asks for.
+    flat_contrast : wanted errors, C. Where the first half of the decision rays finds less contrast, the second half is
+        not traced. Without (0): even pixels take twice as many decision rays.
+    low_contrast : wanted errors, F. From the star alone: where decision rays find less contrast, and no line, a pair
+        gets the rays that their scatter asks for. Without (0): pixels beside an edge take the rays that its contrast
+        asks for.
     flat_part : part, C. Of the rays by the law, a pair in which decision rays find no contrast keeps this part at
         least. Without (0): thin objects between the decision rays make single values that are far off.
     least_difference_rays : rays, C. Least number of rays of a difference. Without: no pilot ray sees a change, and few
@@ -151,7 +154,8 @@ class Tuning:
     edge_footprint_px: float = 1.5
     edge_contrast_rays: float = 0.2
     flat_contrast: float = 4.0
-    flat_part: float = 1 / 8
+    low_contrast: float = 16.0
+    flat_part: float = 1 / 16
     least_difference_rays: int = 64
     difference_gain: float = 4.0
     difference_part: float = 0.5
