@@ -288,7 +288,7 @@ def test_what_a_pilot_compares_and_between_which_looks_it_traces():
     tracer, anchor = MadeUp(light, near), PilotFlux.empty(121)
     anchor.controlled[:], anchor.plain[:] = 240.0, 90.0
     zeros = jit().Float(np.zeros(16 * 121, np.float32))
-    anchored = Anchored(anchor, PilotRays(zeros, zeros, 16, (1.0, 2.0)))
+    anchored = Anchored(anchor, PilotRays(zeros, zeros, 16, (1.0, 2.0)), (-3.0, -2.0))
     numbers = np.repeat(np.arange(9)[:, None], 121, axis=1)
     windows = Windows(np.arange(9.0), np.arange(9.0) + 1)
     pilot, _ = take_pilot(tracer, sites, windows, numbers, 16, 1.25, None, anchored=anchored, stride=4)
