@@ -36,7 +36,8 @@ class Detected:
 
     def pilot(self, index, window, windows, rays, width_px, stream=Stream.RENDER_PILOT, span_us=None, before=None,
               repeat=0):  # fmt: skip
-        self.traced += [(int(stream), rays, width_px, repeat, *pair) for pair in zip(window.tolist(), index.tolist())]
+        pairs = zip(window.tolist(), index.tolist(), strict=True)
+        self.traced += [(int(stream), rays, width_px, repeat, *pair) for pair in pairs]
         found = PilotFlux.empty(index.size)
         light = self.light[window, index]
         if repeat == 1:
@@ -95,7 +96,7 @@ def test_pixels_whose_rays_differ_are_looked_at_in_all_windows():
 
 
 def test_a_first_look_takes_the_estimator_of_less_scatter():
-    """Even up to a scatter of 60; a fifth of the wanted error counts as a change, but at least what rounding explains."""
+    """Even up to a scatter of 60; a fifth of the wanted error counts as a change, or what rounding explains if more."""
     first = PilotFlux.empty(4)
     first.controlled_scatter[:], first.plain_scatter[:] = (59, 61, 90, 90), (70, 70, 61, 59)
     flux = np.array([800, 800, 800, 4e6], np.float32)

@@ -5,7 +5,8 @@ import pytest
 
 from hesim_render.sources.render.change_driven import edge_courses
 from hesim_render.sources.render.change_driven.edge_courses import Courses, courses, fitted_windows
-from hesim_render.sources.render.change_driven.edges import EdgeFit, halfplane_share
+from hesim_render.sources.render.change_driven.edge_share import halfplane_share
+from hesim_render.sources.render.change_driven.edges import EdgeFit
 from hesim_render.sources.render.change_driven.estimates import Flux
 
 #: Middles of windows, unevenly spaced, µs.

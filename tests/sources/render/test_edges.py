@@ -11,7 +11,8 @@ import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
-from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges, halfplane_share
+from hesim_render.sources.render.change_driven.edge_share import halfplane_share
+from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.sources.render.change_driven.edges import EdgeFit, halfplane_share
+from hesim_render.sources.render.change_driven.edge_share import halfplane_share
+from hesim_render.sources.render.change_driven.edges import EdgeFit
 from hesim_render.sources.render.change_driven.estimates import Flux
 
 #: A line is fitted in every so many of the windows in which a pixel changes, and where the next ones are farther.

@@ -64,7 +64,8 @@ def about_edges(
     wanted = wanted[place] / tracer.axis_factor(pixel[place])
     some, little = place[new], np.float32(tuning.flat_contrast) * wanted[new]
     of = pixel[some], window[some], windows, tuning.edge_rays, tuning.edge_footprint_px, controlled[some], little
-    fit.replace(new, tracer.edges(*of, stream))
+    moves = tracer.moves_within(windows)
+    fit.replace(new, tracer.edges(*of, stream, moves))
     # of rays that all see the same, none is above the middle
     contrast = np.maximum(fit.high - fit.low, 0) / wanted
     is_edge = fit.is_edge & (contrast >= 1)
@@ -72,7 +73,8 @@ def about_edges(
     by_scatter = gain.rays(np.where(is_edge, 0, 0.5 * contrast) + fit.scatter / wanted)
     is_flat = ~is_edge & (contrast < tuning.low_contrast)
     # an edge: its contrast says how much a ray weighs that finds the model wrong; half of the rays start in the strip
-    needed = np.where(is_edge, np.maximum(2 * by_scatter, tuning.edge_contrast_rays * contrast), by_scatter)
+    per_contrast = tuning.moving_contrast_rays if moves else tuning.edge_contrast_rays
+    needed = np.where(is_edge, np.maximum(2 * by_scatter, per_contrast * contrast), by_scatter)
     # little contrast: the neighbours gave this pair its rays, and what they show does not reach it
     part = tuning.flat_part if flat_part is None else flat_part
     needed = np.where(is_flat, np.maximum(needed, part * rays[place].astype(np.float32)), needed)

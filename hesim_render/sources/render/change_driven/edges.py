@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Mask, UInt32
 from hesim_render.core.tables import spread_out
+from hesim_render.sources.render.change_driven.edge_search import widest_gap, widest_moving_gap
+from hesim_render.sources.render.change_driven.edge_share import LEAST_SPEED, moving_share
 
-#: Directions of a line that are tried first, and then around the best one so far, each time closer.
-_COARSE, _FINE, _ROUNDS = 48, 8, 3
 #: Half width of a strip beyond the gap that the decision rays leave, px: of edges that are not quite straight.
 _SLACK_PX = 0.004
 #: Largest scatter about the levels of both sides, over their difference: three levels, or a corner, scatter more.
@@ -39,9 +39,10 @@ class PairEdges:
     Parameters
     ----------
     normal_x, normal_y : unit vector towards the side of the higher flux, in columns and rows.
-    offset : of the centre of the pixel from the line, px.
+    offset : of the centre of the pixel from the line in the middle of the window, px.
     half_width : of the strip about the line, px.
     low, high : levels, e⁻/s on the optical axis.
+    speed : of the line against its normal, px per window: the offset grows by it from begin to end.
     """
 
     normal_x: NDArray[np.float32]
@@ -50,6 +51,7 @@ class PairEdges:
     half_width: NDArray[np.float32]
     low: NDArray[np.float32]
     high: NDArray[np.float32]
+    speed: NDArray[np.float32]
 
     @classmethod
     def at(cls, count: int, place: NDArray[np.int64], models: PairEdges) -> PairEdges:
@@ -72,26 +74,12 @@ class PairEdges:
     def mean(self) -> NDArray[np.float64]:
         """Mean of the model over the pixel, e⁻/s on the optical axis."""
         low, high = self.low.astype(np.float64), self.high.astype(np.float64)
-        return low + (high - low) * halfplane_share(self.normal_x, self.normal_y, self.offset)
+        return low + (high - low) * moving_share(self.normal_x, self.normal_y, self.offset, self.speed)
 
 
 def astuple_of(values: PairEdges | EdgeFit) -> tuple[NDArray, ...]:
     """The arrays of a data class, without copies."""
     return tuple(getattr(values, each.name) for each in fields(values))
-
-
-def halfplane_share(
-    normal_x: NDArray[np.floating], normal_y: NDArray[np.floating], offset: NDArray[np.floating]
-) -> NDArray[np.float64]:
-    """Share of the square [-½, ½]² in which normal · place + offset > 0, for unit normals.
-
-    The square is the convolution of two boxes of widths |n_x| and |n_y| along the normal, so the share is the second
-    integral of four steps. A narrow box counts as one of 1e-6 px, which moves the share by less than that.
-    """
-    wide, narrow = (np.maximum(np.abs(side.astype(np.float64)), 1e-6) for side in (normal_x, normal_y))
-    far, near = (wide + narrow) / 2, (wide - narrow) / 2
-    ramps = [np.square(np.maximum(offset + at, 0)) / 2 for at in (far, near, -near, -far)]
-    return np.clip((ramps[0] - ramps[1] - ramps[2] + ramps[3]) / (wide * narrow), 0, 1)
 
 
 @dataclass(frozen=True)
@@ -100,7 +88,7 @@ class EdgeFit:
 
     Parameters
     ----------
-    normal_x, normal_y, offset : the line, see `PairEdges`.
+    normal_x, normal_y, offset, speed : the line, see `PairEdges`.
     gap : width of the strip without any decision ray between both sides, px; negative where no line separates them.
     low, high : mean flux of either side.
     scatter : standard deviation of single rays about the mean of their side.
@@ -111,6 +99,7 @@ class EdgeFit:
     normal_x: NDArray[np.float32]
     normal_y: NDArray[np.float32]
     offset: NDArray[np.float32]
+    speed: NDArray[np.float32]
     gap: NDArray[np.float32]
     low: NDArray[np.float32]
     high: NDArray[np.float32]
@@ -150,22 +139,23 @@ class EdgeFit:
     def models(self, part: NDArray, wider: bool = False) -> PairEdges:
         """Models of some pairs; `wider` strips hold lines that lie askew in the gap as well."""
         half_width = np.float32(1.0 if wider else 0.5) * self.gap[part] + np.float32(_SLACK_PX)
-        levels = self.low[part], self.high[part]
+        levels = self.low[part], self.high[part], self.speed[part]
         return PairEdges(self.normal_x[part], self.normal_y[part], self.offset[part], half_width, *levels)
 
-    def put(self, part: slice, decision_rays: Sequence[Float], rays: int) -> None:
+    def put(self, part: slice, decision_rays: Sequence[Float], rays: int, moves: bool = False) -> None:
         """Fit lines to pairs with `rays` decision rays each.
 
         Parameters
         ----------
         part : pairs that were traced.
-        decision_rays : of one pair after the other: x and y of each ray, px from the centre of its pixel, and its flux,
-            e⁻/s on the optical axis.
+        decision_rays : of one pair after the other: x and y of each ray, px from the centre of its pixel, its time,
+            windows from the middle of its own, and its flux, e⁻/s on the optical axis.
         rays : number of rays of each pair, a power of two.
+        moves : True where lines may move within the window.
         """
         import drjit as dr
 
-        types, (x, y, flux) = jit(), decision_rays
+        types, (x, y, time, flux) = jit(), decision_rays
         ray = dr.arange(types.UInt32, len(flux))
         of, count = ray // dr.opaque(types.UInt32, rays), dr.opaque(types.Float, rays)
 
@@ -185,9 +175,13 @@ class EdgeFit:
         scatter = unit * dr.sqrt(dr.block_sum(dr.square(deviation / spread(unit)), rays) / count)
         side = dr.select(above, types.Float(1), -1)
         dr.eval(side, low, high, scatter, above_count, below_count)
-        angle, gap, at = _widest_gap(x, y, side, rays)
-        sine, cosine = dr.sincos(angle)
-        values = cosine, sine, -at, gap, low, high, scatter, dr.minimum(above_count, below_count)
+        if moves:
+            line = widest_moving_gap(x, y, time, side, rays)
+        else:
+            angle, gap, at = widest_gap(x, y, side, rays)
+            sine, cosine = dr.sincos(angle)
+            line = cosine, sine, -at, dr.zeros(types.Float, len(gap)), gap
+        values = *line, low, high, scatter, dr.minimum(above_count, below_count)
         dr.eval(values)
         self.rays[part] = rays
         for out, value in zip(astuple_of(self)[:-1], values, strict=True):
@@ -199,7 +193,7 @@ def joined_rays(first: Sequence[Float], pairs: NDArray[np.int64], more: Sequence
 
     Parameters
     ----------
-    first : of all pairs, `rays` each.
+    first : of all pairs, `rays` each, as many values as `more` has.
     pairs : [n], pairs that have more.
     more : of these pairs, as many each.
     rays : a power of two.
@@ -220,63 +214,13 @@ def joined_rays(first: Sequence[Float], pairs: NDArray[np.int64], more: Sequence
     return merged
 
 
-def _widest_gap(x: Float, y: Float, side: Float, rays: int) -> tuple[Float, Float, Float]:
-    """Direction in which the two sides of each pair are farthest apart, the gap, and the place of its middle.
-
-    A search over directions in steps that become finer; in each direction, all rays of the pair are projected.
-    """
-    import drjit as dr
-
-    types = jit()
-    pair = dr.arange(types.UInt32, len(side) // rays)
-    first, last = pair * dr.opaque(types.UInt32, rays), (pair + 1) * dr.opaque(types.UInt32, rays)
-
-    def ends(angle: Float) -> tuple[Float, Float]:
-        """Largest projection of the lower side, smallest of the higher one."""
-        sine, cosine = dr.sincos(angle)
-
-        def step(k: UInt32, lower: Float, higher: Float) -> tuple[UInt32, Float, Float]:
-            at = cosine * dr.gather(types.Float, x, k) + sine * dr.gather(types.Float, y, k)
-            is_high = dr.gather(types.Float, side, k) > 0
-            lower = dr.maximum(lower, dr.select(is_high, -10.0, at))
-            return k + 1, lower, dr.minimum(higher, dr.select(is_high, at, 10.0))
-
-        state = types.UInt32(first), dr.full(types.Float, -10, len(pair)), dr.full(types.Float, 10, len(pair))
-        _, lower, higher = dr.while_loop(state, lambda k, *_: k < last, step, label="projected rays")
-        return lower, higher
-
-    def attempt(
-        number: UInt32, centre: Float, best: Float, gap: Float, at: Float
-    ) -> tuple[UInt32, Float, Float, Float, Float]:
-        is_coarse = number < _COARSE
-        fine = number - _COARSE
-        # each round spans one step of the round before it
-        centre = dr.select(~is_coarse & (fine % _FINE == 0), best, centre)
-        span = (2 * np.pi / _COARSE) * dr.power(types.Float(1 / _FINE), types.Float(fine // _FINE))
-        place = (types.Float(fine % _FINE) + 0.5) / _FINE - 0.5
-        angle = dr.select(is_coarse, types.Float(number) * (2 * np.pi / _COARSE), centre + place * span)
-        lower, higher = ends(angle)
-        wider = higher - lower > gap
-        return (
-            number + 1, centre, dr.select(wider, angle, best), dr.select(wider, higher - lower, gap),
-            dr.select(wider, 0.5 * (lower + higher), at),
-        )  # fmt: skip
-
-    zero = dr.zeros(types.Float, len(pair))
-    state = dr.zeros(types.UInt32, len(pair)), zero, zero, dr.full(types.Float, -100, len(pair)), zero
-    best_fit = dr.while_loop(
-        state, lambda number, *_: number < _COARSE + _ROUNDS * _FINE, attempt, label="directions of edges"
-    )
-    return best_fit[2], best_fit[3], best_fit[4]
-
-
 @dataclass(frozen=True)
 class LaneEdges:
     """Models of pairs, on the device, per ray.
 
     Parameters
     ----------
-    normal_x, normal_y, offset, half_width, low, high : see `PairEdges`.
+    normal_x, normal_y, offset, half_width, low, high, speed : see `PairEdges`.
     is_strip : True if this ray starts in the strip.
     """
 
@@ -286,6 +230,7 @@ class LaneEdges:
     half_width: Float
     low: Float
     high: Float
+    speed: Float
     is_strip: Mask
 
     @classmethod
@@ -303,31 +248,53 @@ class LaneEdges:
         spread = {each.name: spread_out(kind, getattr(edges, each.name)[pair], lane) for each in fields(edges)}
         return cls(**spread, is_strip=is_strip)
 
-    def place(self, uniform: tuple[Float, Float], point: tuple[Float, Float]) -> tuple[Float, Float, Float, Float]:
-        """Place of each ray, px from the centre of its pixel, its weight, and the model's flux there.
+    def place(
+        self, uniform: tuple[Float, Float], point: tuple[Float, Float], share: Float
+    ) -> tuple[Float, Float, Float, Float, Float]:
+        """Place of each ray, px from the centre of its pixel, its share of the window, its weight, and the model's flux
+        there.
 
         Parameters
         ----------
         uniform : places of rays that start uniformly in the pixel.
         point : [0, 1)², place inside the strip, across and along it.
+        share : [0, 1), share of the window at which a ray starts.
         """
         import drjit as dr
 
-        # a strip is drawn line by line: the distance from its middle, then a point of the part inside of the pixel
+        # a strip that moves is drawn at times at which its line meets the pixel
+        moves = abs(self.speed) > LEAST_SPEED
+        begin, span = self._times(moves)
+        drawn = dr.fma(span, share, begin)
+        share = dr.select(moves & self.is_strip & (span > 0), drawn, share)
+        offset = dr.select(moves, dr.fma(self.speed, share - 0.5, self.offset), self.offset)
+        is_met = ~moves | ((share >= begin) & (share <= begin + span) & (span > 0))
+        # at its time, it is drawn line by line: the distance from its middle, then a point of the part inside of it
         across = dr.fma(2 * self.half_width, point[0], -self.half_width)
-        begin, length = self._inside(across - self.offset)
-        along = dr.fma(length, point[1], begin)
-        away = across - self.offset
+        first, length = self._inside(across - offset)
+        along = dr.fma(length, point[1], first)
+        away = across - offset
         strip = self.normal_x * away - self.normal_y * along, self.normal_y * away + self.normal_x * along
         # a line that misses the pixel has no point in it: such a ray starts anywhere, and counts for nothing
-        is_strip = self.is_strip & (length > 0)
+        is_strip = self.is_strip & (length > 0) & is_met
         x, y = (dr.select(is_strip, a, b) for a, b in zip(strip, uniform, strict=True))
-        distance = dr.fma(self.normal_x, x, dr.fma(self.normal_y, y, self.offset))
-        _, own_length = self._inside(distance - self.offset)
-        inside = (self.is_strip | (abs(distance) <= self.half_width)) & (own_length > 0)
+        distance = dr.fma(self.normal_x, x, dr.fma(self.normal_y, y, offset))
+        _, own_length = self._inside(distance - offset)
+        inside = (self.is_strip | (abs(distance) <= self.half_width)) & (own_length > 0) & is_met
         density = dr.select(inside, dr.rcp(2 * self.half_width * own_length), 0)
+        density = dr.select(moves & inside, density * dr.rcp(span), density)
         weight = dr.select(is_strip | ~self.is_strip, 2 / (1 + density), 0)
-        return x, y, weight, dr.select(distance > 0, self.high, self.low)
+        return x, y, share, weight, dr.select(distance > 0, self.high, self.low)
+
+    def _times(self, moves: Mask) -> tuple[Float, Float]:
+        """Begin and length of the time in which a moving line meets the pixel, shares of the window."""
+        import drjit as dr
+
+        reach = 0.5 * (abs(self.normal_x) + abs(self.normal_y))
+        per_px = dr.rcp(dr.select(moves, self.speed, 1))
+        one, other = (-reach - self.offset) * per_px + 0.5, (reach - self.offset) * per_px + 0.5
+        begin = dr.maximum(dr.minimum(one, other), 0)
+        return begin, dr.maximum(dr.minimum(dr.maximum(one, other), 1) - begin, 0)
 
     def _inside(self, away: Float) -> tuple[Float, Float]:
         """Begin and length of the part inside of the pixel of a line, which has a distance from the pixel's centre

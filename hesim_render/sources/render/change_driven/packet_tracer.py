@@ -33,6 +33,8 @@ from hesim_render.spectral.waveform import Waveform
 LEAST_SAMPLES, MOST_SAMPLES = 8, 4096
 #: Rays of a packet.
 PACKET = LEAST_SAMPLES
+#: Windows within which nothing moves far, µs: those of asynchronous sensors are much shorter.
+_SHORT_US = 100.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class _Rays:
     now : its time.
     filter : of its pixel.
     place : of its start, px from the centre of its pixel.
+    share : of the window, at which it starts.
     weight : None for 1.
     model : flux of the model of an edge, e⁻/s on the optical axis; None for 0.
     """
@@ -53,6 +56,7 @@ class _Rays:
     now: Moment
     filter: UInt32
     place: tuple[Float, Float]
+    share: Float
     weight: Float | None
     model: Float | None
 
@@ -66,10 +70,12 @@ class _Traced:
     fluxes : the integrator's three fluxes, weighted, e⁻/s on the optical axis, and 1 where the ray met the box of a
         moving object, else 0.
     place : of its start, px from the centre of its pixel.
+    share : of the window, at which it starts.
     """
 
     fluxes: tuple[Float, Float, Float, UInt32]
     place: tuple[Float, Float]
+    share: Float
 
 
 class PacketTracer(Tracer):
@@ -128,6 +134,11 @@ class PacketTracer(Tracer):
     def is_diffuse(self) -> bool:
         """True if all visible light is direct light on diffuse surfaces."""
         return isinstance(self._integrator, DiffuseIntegrator)
+
+    def moves_within(self, windows: Windows) -> bool:
+        """True if edges may move by more than a small part of a pixel within a window."""
+        something = bool(self.parts.groups) or self.camera is not None
+        return something and bool(np.any(windows.end_us - windows.begin_us > _SHORT_US))
 
     def _key(self, stream: Stream) -> UInt64:
         import drjit as dr
@@ -215,6 +226,7 @@ class PacketTracer(Tracer):
             rays.weight,
             rays.model,
             rays.place,
+            rays.share,
         )
         *fluxes, met = self._integrator.flux(self._sampler, rays.ray, now, rays.filter)
         bits = dr.select(met, types.UInt32(1), dr.zeros(types.UInt32, used * PACKET))
@@ -224,7 +236,7 @@ class PacketTracer(Tracer):
             model = 0 if rays.model is None else rays.model
             fluxes = [(flux - model) * rays.weight for flux in fluxes]
             dr.eval(fluxes)
-        return _Traced((fluxes[0], fluxes[1], fluxes[2], bits), rays.place)
+        return _Traced((fluxes[0], fluxes[1], fluxes[2], bits), rays.place, rays.share)
 
     def _rays_of(
         self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float, aims: LaneAims | LaneEdges | None
@@ -242,11 +254,11 @@ class PacketTracer(Tracer):
         (x, y), weight, slot, model = self.rays.offset(widened, blur, centre), None, types.UInt32(0), None
         if isinstance(aims, LaneAims):
             slot, moment = self._aim.choose(aims, moment)
+        elif isinstance(aims, LaneEdges):
+            x, y, moment, weight, model = aims.place((x, y), aperture, moment)
         now = moments.at(window, moment)
         pose = None if self.camera is None else self.camera.pose_at(now.local_us(len(self.parts.groups)))
-        if isinstance(aims, LaneEdges):
-            x, y, weight, model = aims.place((x, y), aperture)
-        elif aims is not None:
+        if isinstance(aims, LaneAims):
             x, y, weight = self._aim.place(aims, slot, now, pose, centre, (x, y), aperture)
         origin, direction, weight = self.rays.through_lens(centre, (x, y), sampler, weight=weight)
         if pose is not None:
@@ -255,4 +267,4 @@ class PacketTracer(Tracer):
         tile_col = col - col // self._tile_cols * self._tile_cols
         which = dr.gather(types.UInt32, self._filter_tile, tile_row * self._tile_cols + tile_col)
         primary = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
-        return _Rays(primary, now, which, (x, y), weight, model)
+        return _Rays(primary, now, which, (x, y), moment, weight, model)

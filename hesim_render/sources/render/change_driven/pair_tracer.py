@@ -173,6 +173,7 @@ class PairTracer(PacketTracer):
         controlled: NDArray[np.bool_],
         least: NDArray[np.float32],
         stream: Stream = Stream.RENDER_EDGE,
+        moves: bool = False,
     ) -> EdgeFit:
         """Lines fitted to a few rays of every listed pair, with random numbers of their own.
 
@@ -183,6 +184,7 @@ class PairTracer(PacketTracer):
             little contrast, and twice as many where there is a line.
         footprint_px : width of the area in which these rays start, pixels.
         least : [n], contrast below which it is little, e⁻/s on the optical axis.
+        moves : True where lines may move within the windows.
 
         Returns
         -------
@@ -203,9 +205,10 @@ class PairTracer(PacketTracer):
                 samples,
                 footprint_px,
                 stream,
+                moves,
                 *flux_inputs(windows, None, None),
             )
-            given = lanes, controlled[part], least[part], moments, key, samples, footprint, out, part
+            given = lanes, controlled[part], least[part], moments, key, samples, footprint, out, part, moves
             trace = partial(self._edge_block, *given)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report(int(out.rays[part].sum(dtype=np.int64)))
@@ -222,6 +225,7 @@ class PairTracer(PacketTracer):
         footprint: Float,
         out: EdgeFit,
         part: slice,
+        moves: bool,
     ) -> None:
         """Lines of some pairs: of rays all over the pixel, as many more where these show contrast, and twice as many
         about a line, where there is one.
@@ -231,7 +235,7 @@ class PairTracer(PacketTracer):
         def decision_rays(
             some: NDArray[np.int64], rays: int, repeat: int, about: PairEdges | None = None
         ) -> list[Float]:
-            """Place and flux of the rays of some pairs."""
+            """Place, time and flux of the rays of some pairs."""
             packets = np.full(some.size, rays // PACKET)
             chosen = [values[some] for values in lanes[:2]] + [np.full(some.size, repeat, np.uint32)]
             width = footprint if about is None else dr.opaque(jit().Float, 1.0)
@@ -239,23 +243,23 @@ class PairTracer(PacketTracer):
             types = jit()
             packet = dr.arange(types.UInt32, len(traced.fluxes[0])) // PACKET
             by_control = spread_out(types.UInt32, np.repeat(controlled[some].astype(np.uint32), packets), packet)
-            values = [*traced.place, dr.select(by_control != 0, traced.fluxes[0], traced.fluxes[1])]
+            values = [*traced.place, traced.share - 0.5, dr.select(by_control != 0, traced.fluxes[0], traced.fluxes[1])]
             dr.eval(values)
             return values
 
         every, half = np.arange(lanes[0].size), samples // 2
         first, fit = decision_rays(every, half, 0), EdgeFit.empty(every.size)
-        fit.put(slice(None), first, half)
+        fit.put(slice(None), first, half, moves)
         uneven = np.flatnonzero(fit.high - fit.low >= least)
         if uneven.size:
             both = joined_rays(first, uneven, decision_rays(uneven, half, 1), half)
             better = EdgeFit.empty(uneven.size)
-            better.put(slice(None), both, samples)
+            better.put(slice(None), both, samples, moves)
             lines = np.flatnonzero(better.is_line)
             if lines.size:
                 refined = EdgeFit.empty(lines.size)
                 more = decision_rays(uneven[lines], samples, 2, better.models(lines, wider=True))
-                refined.put(slice(None), joined_rays(both, lines, more, samples), 2 * samples)
+                refined.put(slice(None), joined_rays(both, lines, more, samples), 2 * samples, moves)
                 better.replace(lines, refined)
             fit.replace(uneven, better)
         out.replace(part, fit)

@@ -91,6 +91,8 @@ class Tuning:
         line that only just enters a pixel, or passes beside it, is not seen.
     edge_contrast_rays : rays per wanted error, F. Rays of a pair with a line for each wanted error of contrast between
         its sides; from the star alone. Without (0): what the decision rays missed makes single values that are far off.
+    moving_contrast_rays : rays per wanted error, F. From the star on `eiger` alone: the same of a line that may move
+        within the window. Without (as few as `edge_contrast_rays`): single values are far off.
     flat_contrast : wanted errors, C. Where the first half of the decision rays finds less contrast, the second half is
         not traced. Without (0): even pixels take twice as many decision rays.
     low_contrast : wanted errors, F. From the star alone: where decision rays find less contrast, and no line, a pair
@@ -153,6 +155,7 @@ class Tuning:
     edge_rays: int = 64
     edge_footprint_px: float = 1.5
     edge_contrast_rays: float = 0.2
+    moving_contrast_rays: float = 0.5
     flat_contrast: float = 4.0
     low_contrast: float = 16.0
     flat_part: float = 1 / 16
