@@ -33,8 +33,8 @@ def fits(window, pixel, **changed):
     )
     count = len(window)
     fit = EdgeFit(*(np.asarray(v, np.float32) for v in (
-        np.cos(angle), np.sin(angle), offset, np.full(count, 0.004), LOW[pixel], HIGH[pixel], np.zeros(count),
-        np.full(count, 20), np.full(count, 128),
+        np.cos(angle), np.sin(angle), offset, np.zeros(count), np.full(count, 0.004), LOW[pixel], HIGH[pixel],
+        np.zeros(count), np.full(count, 20), np.full(count, 128),
     )))  # fmt: skip
     for name, values in changed.items():
         getattr(fit, name)[:] = values

@@ -1,6 +1,7 @@
 """Lines through pixels and rays about them: mean of the model, fit of the line, and that no model moves an estimate."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
-from hesim_render.sources.render.change_driven.edge_share import halfplane_share
-from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
+from hesim_render.sources.render.change_driven.edge_share import halfplane_share, moving_share
+from hesim_render.sources.render.change_driven.edges import EdgeFit, LaneEdges, PairEdges
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -38,7 +39,8 @@ def test_the_share_of_a_pixel_beside_a_line():
 def fitted(x, y, flux):
     """A fit to rays [pair, ray]."""
     types, found = jit(), EdgeFit.empty(len(x))
-    found.put(slice(None), [types.Float(v.ravel().astype(np.float32)) for v in (x, y, flux)], x.shape[1])
+    values = x, y, np.zeros(x.shape), flux
+    found.put(slice(None), [types.Float(v.ravel().astype(np.float32)) for v in values], x.shape[1])
     return found
 
 
@@ -127,8 +129,9 @@ def edges():
     return tracer, pairs, controlled, np.stack(traced).astype(np.float64)
 
 
-def test_no_model_moves_the_mean(edges):
-    """Wrong lines, wrong levels and strips of any width: 96 independent estimates of each pair agree with plain rays.
+@pytest.mark.parametrize("speed", [0.0, 2.3])
+def test_no_model_moves_the_mean(edges, speed):
+    """Wrong lines, at rest or moving, wrong levels and strips of any width: 96 estimates agree with plain rays.
 
     One χ² over all pairs, to which one extreme z of the pairs is added; false alarms: 1e-4 each.
     """
@@ -137,7 +140,7 @@ def test_no_model_moves_the_mean(edges):
     x, y, offset = lines(rng, count)
     level = plain.mean(axis=0) / tracer.axis_factor(pairs[0])
     low, high = level * rng.uniform(0.3, 0.9, count), level * rng.uniform(1.1, 2, count)
-    wrong = x, y, offset, rng.uniform(0.01, 0.4, count), low, high
+    wrong = x, y, offset, rng.uniform(0.01, 0.4, count), low, high, speed * rng.uniform(-1, 1, count)
     models = PairEdges(*(values.astype(np.float32) for values in wrong))
     rays = rng.choice([64, 256], count)
     found = np.stack([tracer.trace(*pairs, rays, controlled, repeat=k, edges=models).mean for k in range(times)])
@@ -224,13 +227,19 @@ def test_rays_follow_from_what_the_decision_rays_saw():
     scatter = np.array([0, 0, 0, 0, 0, 0, 40.0, 0])  # the last but one has no even levels
     gap = np.array([0.01, 0.02, -1, 0.03, -1, 0.01, 0.01, 0.01])
     fit = EdgeFit(*(v.astype(np.float32) for v in (
-        np.ones(8), np.zeros(8), np.zeros(8), gap, np.full(8, 7.0), 7 + contrast, scatter, np.full(8, 20.0),
-        np.full(8, 128.0),
+        np.ones(8), np.zeros(8), np.zeros(8), np.zeros(8), gap, np.full(8, 7.0), 7 + contrast, scatter,
+        np.full(8, 20.0), np.full(8, 128.0),
     )))  # fmt: skip
     tried = []
 
     class Tracer:
-        def edges(self, pixel, window, windows, samples, footprint_px, controlled, least, stream):
+        moves = False
+
+        def moves_within(self, windows):
+            return self.moves
+
+        def edges(self, pixel, window, windows, samples, footprint_px, controlled, least, stream, moves):
+            assert moves == self.moves
             tried.append((pixel.tolist(), samples, footprint_px, stream))
             np.testing.assert_allclose(least, 4 * 2.5)  # wanted errors on the axis
             return EdgeFit(*(getattr(fit, name)[pixel] for name in vars(fit)))
@@ -242,10 +251,10 @@ def test_rays_follow_from_what_the_decision_rays_saw():
     floor, controlled, wanted = np.array([0, 0, 0, 0, 0, 300, 0, 0]), np.ones(8, bool), np.full(8, 2.0, np.float32)
     given = law, controlled, wanted, floor, Gain(*TUNING.diffuse_gain), TUNING
     rays, edges = about_edges(Tracer(), (pixel, 0 * pixel, None), *given)
-    # 0.2 rays for each wanted error of contrast, 64 at least; an eighth of the law where there is no
+    # 0.2 rays for each wanted error of contrast, 64 at least; a sixteenth of the law where there is no
     # contrast, also if rounding makes a line of it, 32 at least; a corner as by the law; the floor;
     # three levels as by the law; and a pair of few rays is not looked at
-    assert rays.tolist() == [64, 256, 256, 32, 1024, 512, 1024, 128]
+    assert rays.tolist() == [64, 256, 128, 32, 1024, 512, 1024, 128]
     assert edges.is_there.tolist() == [True, True, False, False, False, True, False, False]
     assert tried == [(list(range(7)), 64, 1.5, Stream.RENDER_EDGE)]
     np.testing.assert_allclose(edges.half_width[:2], [0.009, 0.014], rtol=1e-5)
@@ -253,3 +262,143 @@ def test_rays_follow_from_what_the_decision_rays_saw():
                               stream=Stream.AUDIT_EDGE)  # fmt: skip
     assert rays.tolist() == [2048, 4096, 1024, *law[3:]] and edges is None
     assert tried[1][0] == [2] and tried[1][3] == Stream.AUDIT_EDGE
+    # a line that may move takes half a ray for each wanted error of contrast
+    moving = Tracer()
+    moving.moves = True
+    assert about_edges(moving, (pixel, 0 * pixel, None), *given)[0].tolist()[:3] == [64, 512, 128]
+
+
+def test_pairs_of_low_contrast_take_the_rays_of_their_own_scatter():
+    """Contrasts of 15 and 17 wanted errors: (0.68·(7.5 + 1))^(1/0.7) = 12 rays, 32 at least; 17 is as by the law."""
+    contrast, scatter = np.array([15.0, 17.0, 15.0]), np.array([1.0, 1.0, 30.0])
+    fit = EdgeFit(*(np.asarray(v, np.float32) for v in (
+        np.ones(3), np.zeros(3), np.zeros(3), np.zeros(3), np.full(3, -0.4), np.full(3, 90.0), 90 + contrast, scatter,
+        np.full(3, 20.0), np.full(3, 64.0),
+    )))  # fmt: skip
+    tracer = SimpleNamespace(
+        edges=lambda pixel, *_: fit.at(pixel), axis_factor=lambda pixel: np.ones(pixel.size, np.float32),
+        moves_within=lambda windows: False,
+    )  # fmt: skip
+    pixel, law, ones = np.arange(3), np.full(3, 512), np.ones(3, np.float32)
+    given = law, ones > 0, ones, np.zeros(3), Gain(0.68, 0.7), TUNING
+    rays, edges = about_edges(tracer, (pixel, 0 * pixel, None), *given)
+    # 0.68·37.5 = 25.5 is 102.1 rays
+    assert rays.tolist() == [32, 512, 128] and edges is None
+
+
+def planes(rng, count):
+    """Lines that move, up to 3 px per window, and rest, along axes and askew."""
+    x, y, offset = lines(rng, count)
+    speed = rng.uniform(-3, 3, count)
+    speed[:6] = 0, 2e-4, -1.7, 1e-3, 0.37, -1e-3
+    return x, y, offset, speed
+
+
+def test_the_share_of_a_pixel_and_a_window_beside_a_moving_line():
+    """The mean of the share at rest over 4000 times, by the rule of the middle, and that of half a million points."""
+    rng = np.random.default_rng(8)
+    x, y, offset, speed = planes(rng, 80)
+    share = moving_share(x, y, offset, speed)
+    times = (np.arange(4000) + 0.5) / 4000 - 0.5
+    mean = [halfplane_share(np.full(4000, a), np.full(4000, b), c + v * times).mean()
+            for a, b, c, v in zip(x, y, offset, speed, strict=True)]  # fmt: skip
+    np.testing.assert_allclose(share, mean, atol=3e-5)
+    points = rng.random((3, 500_000)) - 0.5
+    counted = [np.mean(a * points[0] + b * points[1] + c + v * points[2] > 0)
+               for a, b, c, v in zip(x[:20], y[:20], offset[:20], speed[:20], strict=True)]  # fmt: skip
+    np.testing.assert_allclose(share[:20], counted, atol=4e-3)
+    assert share[0] == halfplane_share(x, y, offset)[0]
+
+
+def test_the_moving_line_is_found():
+    """Rays beside planes in place and time: 95 of 100 are found, and no ray is on the wrong side."""
+    rng, rays = np.random.default_rng(9), 64
+    a, b, c, v = planes(rng, 300)
+    x, y, time = rng.random((3, 300, rays)) - 0.5
+    distance = a[:, None] * x + b[:, None] * y + 0.4 * c[:, None] + v[:, None] * time
+    found = EdgeFit.empty(300)
+    flux, types = np.where(distance > 0, 830.0, 270.0), jit()
+    values = [types.Float(each.ravel().astype(np.float32)) for each in (x, y, time, flux)]
+    found.put(slice(None), values, rays, moves=True)
+    own = (found.normal_x[:, None] * x + found.normal_y[:, None] * y + found.offset[:, None]
+           + found.speed[:, None] * time)  # fmt: skip
+    is_found = found.is_edge
+    assert is_found.mean() > 0.95 and ((own > 0) == (distance > 0))[is_found].all()
+    np.testing.assert_allclose(np.abs(own).min(axis=1)[is_found], found.gap[is_found] / 2, atol=2e-4)
+    np.testing.assert_allclose(np.hypot(found.normal_x, found.normal_y), 1, rtol=1e-4)
+    # the widest gap is at least as wide as that about the true plane, but for the steps of the search
+    scale = np.sqrt((1 + found.speed**2) / (1 + v**2))
+    room = np.where(distance > 0, distance, np.inf).min(axis=1) + np.where(distance < 0, -distance, np.inf).min(axis=1)
+    assert np.mean((found.gap > 0.9 * room * scale)[is_found]) > 0.95
+
+
+def test_a_flash_is_seldom_a_line():
+    """Light that is switched on within the window parts the rays by time alone; no line is faster than 8 px."""
+    rng = np.random.default_rng(10)
+    x, y, time = rng.random((3, 20, 64)) - 0.5
+    found, types = EdgeFit.empty(20), jit()
+    flux = np.where(time > 0.1 + 0.02 * x, 830.0, 270.0)
+    found.put(slice(None), [types.Float(v.ravel().astype(np.float32)) for v in (x, y, time, flux)], 64, moves=True)
+    assert found.is_line.mean() < 0.4 and np.abs(found.speed[found.is_line]).max(initial=0) <= 8
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.37, -1.7])
+def test_rays_of_a_strip_have_their_density(speed):
+    """Of places and times all over, those in the strip have weights 2/(1 + q), and q has the integral 1; rays that are
+    drawn lie in it, with the same weight at their place, in the times in which the line meets the pixel.
+    """
+    import drjit as dr
+
+    types, count = jit(), 1 << 18
+    rng = np.random.default_rng(11)
+    model = dict(normal_x=0.8, normal_y=-0.6, offset=0.27, half_width=0.09, low=40.0, high=130.0, speed=speed)
+
+    def placed(is_strip):
+        filled = {name: dr.full(types.Float, value, count) for name, value in model.items()}
+        given = [types.Float(v.astype(np.float32)) for v in rng.random((5, count))]
+        lanes = LaneEdges(**filled, is_strip=dr.full(types.Bool, is_strip, count))
+        out = lanes.place((given[0] - 0.5, given[1] - 0.5), (given[2], given[3]), given[4])
+        return [np.array(v, np.float64) for v in out], np.array(given[4])
+
+    (x, y, share, weight, flux), drawn = placed(False)
+    distance = 0.8 * x - 0.6 * y + 0.27 + speed * (share - 0.5)
+    np.testing.assert_array_equal(share, drawn)
+    np.testing.assert_array_equal(flux, np.where(distance > 0, 130, 40))
+    density = 2 / weight - 1
+    assert np.all((density > 0) == ((abs(distance) <= 0.09) & (density > 0)))
+    times = np.clip(sorted((np.array([-0.7, 0.7]) - 0.27) / speed) if speed else [-0.5, 0.5], -0.5, 0.5)
+    at = share - 0.5
+    is_in = (abs(distance) < 0.0899) & (at > times[0] + 1e-4) & (at < times[1] - 1e-4)
+    assert np.all(density[is_in] > 0) and np.all(density[(at < times[0] - 1e-4) | (at > times[1] + 1e-4)] == 0)
+    # some drawn rays find no point of the pixel at their distance, and count for nothing
+    (x, y, share, weight, _), _ = placed(True)
+    met = weight > 0
+    assert density.mean() == pytest.approx(met.mean(), abs=0.02) and met.mean() > 0.85
+    distance = 0.8 * x - 0.6 * y + 0.27 + speed * (share - 0.5)
+    assert np.all(abs(distance[met]) <= 0.0901) and np.all(np.maximum(abs(x), abs(y))[met] <= 0.5001)
+    assert np.all((share[met] - 0.5 >= times[0] - 1e-4) & (share[met] - 0.5 <= times[1] + 1e-4))
+    # the mean of anything over the strip by its own rays, over their density
+    value = 1 + 2 * x - 0.7 * y + 3 * share**2
+    own = (value / (2 / np.where(met, weight, 1) - 1))[met].sum() / met.size
+    (x, y, share, weight, _), _ = placed(False)
+    value = 1 + 2 * x - 0.7 * y + 3 * share**2
+    assert own == pytest.approx(np.mean(value * (weight < 2)), rel=0.02)
+
+
+def test_few_rays_about_a_moving_line_do_the_work_of_many():
+    """Windows of 2 ms, in which the plates move by a third of a pixel: 64 rays against 256 and 1024 plain ones."""
+    tracer = pair_tracer(plates(), hr.load_sensor("davis346").crop(60, 44))
+    pixel = np.tile(tracer.sensor.layout.full_index.ravel(), 2)
+    window, begin = np.repeat(np.arange(2), pixel.size // 2), np.array([1300.0, 21_000.0])
+    windows, controlled = Windows(begin, begin + 2000), np.ones(pixel.size, np.bool_)
+    fit = tracer.edges(pixel, window, windows, 64, 1.5, controlled, np.zeros(pixel.size, np.float32), moves=True)
+    here = np.flatnonzero(fit.is_edge & (np.abs(fit.speed) > 0.05) & (fit.high > 1.02 * fit.low))
+    assert here.size > 150 and tracer.moves_within(windows) and not tracer.moves_within(Windows(begin, begin + 99))
+    pairs, few = (pixel[here], window[here], windows), np.full(here.size, 64)
+    truth = np.mean(
+        [tracer.trace(*pairs, 64 * few, controlled[here], Stream.AUDIT, repeat=k).mean for k in range(4)], axis=0
+    )
+    by_line = tracer.trace(*pairs, few, controlled[here], edges=fit.models(here)).mean - truth
+    plainly = {times: tracer.trace(*pairs, times * few, controlled[here]).mean - truth for times in (4, 16)}
+    assert np.sqrt(np.mean(by_line**2)) < np.sqrt(np.mean(plainly[4] ** 2))
+    assert np.median(np.abs(by_line)) < np.median(np.abs(plainly[16]))
