@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from benchmarks import small
+from steps import Steps
 from hesim_render.benchmark import Benchmark, build_benchmark, evaluate_benchmark
 from hesim_render.benchmark.evaluate import NOTHING, score_summary, score_table, verdicts
 from hesim_render.benchmark.pictures import ClipDevelopment
@@ -31,7 +32,10 @@ def built(tmp_path_factory):
 
 
 def test_every_task_has_scores(built, tmp_path):
-    result = evaluate_benchmark(built.root, out=tmp_path / "r.json")
+    told = Steps()
+    result = evaluate_benchmark(built.root, out=tmp_path / "r.json", progress=told)
+    told.count()
+    assert len(told) == 1
     found = result["summary"]
     assert set(found["deblur"]) == {"blurred", "double-integral"}
     assert set(found["interpolate"]) == {"hold", "average", "double-integral"}

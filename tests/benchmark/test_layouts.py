@@ -7,6 +7,7 @@ from PIL import Image
 
 import hesim_render as hr
 from benchmarks import small
+from steps import Steps
 from hesim_render.benchmark import build_benchmark
 from hesim_render.benchmark.layouts import cumulative_grid, export_benchmark
 from hesim_render.core.errors import OutputError, RangeError, SpecError
@@ -130,7 +131,10 @@ def test_an_export_appears_whole_or_not_at_all(built, tmp_path):
     export_benchmark(built.root, "raw-npz", tmp_path / "x")
     with pytest.raises(OutputError, match="overwrite"):
         export_benchmark(built.root, "raw-npz", tmp_path / "x")
-    export_benchmark(built.root, "hs-ergb", tmp_path / "x", overwrite=True)
+    told = Steps()
+    export_benchmark(built.root, "hs-ergb", tmp_path / "x", overwrite=True, progress=told)
+    told.count()
+    assert len(told) == len(list(built.clips()))
     assert (tmp_path / "x" / "layout.txt").read_text() == "hs-ergb\n"
     with pytest.raises(SpecError):
         export_benchmark(tmp_path, "hs-ergb", tmp_path / "y")

@@ -4,10 +4,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy import special
 from scipy.stats import norm
 
-from hesim_render.report import emva, latency, limits, modulated, s_curves
+from hesim_render.report import drawings, emva, figures, latency, limits, modulated, s_curves
 from hesim_render.report.estimates import crossing, log_estimated, mean_error, quantile, whole_us_quantile
 from hesim_render.report.latency import Answers
 from hesim_render.report.steady import Background, _rate, doubling
@@ -220,3 +221,39 @@ def test_the_widths_of_an_s_curve_and_their_errors_are_those_of_the_logarithms(m
         assert told["value"] == pytest.approx(100 * sign * (np.exp(sign * 0.21) - 1))
         assert told["standard_error"] == pytest.approx(100 * np.exp(sign * 0.21) * np.sqrt(covariance[0, 0]))
         assert entries["threshold"]["standard_error"] == pytest.approx(np.sqrt(covariance[0, 0]))
+
+
+def test_ends_of_the_range_are_as_sure_as_the_fewest_answers(monkeypatch):
+    """Steps times pixels of the light that has the fewest of them decides how near to 1 a share can be known."""
+    counts = []
+    monkeypatch.setattr(limits, "crossing", lambda *given: counts.append(given[-1]) or (0.3, 0.01))
+    sizes = [(40, 30), (7, 50), (90, 4), (25, 60)]  # 1200, 350, 360, 1500
+    answers = [Answers(2.0**k, 0.5, None, c, 0.95, 0.01, p, {}, {}, 40) for k, (c, p) in enumerate(sizes)]
+    limits.dynamic_range(answers, [0.0] * 4)
+    each = {one.count * one.pixels for one in answers}
+    assert counts == [min(each)] * 2 and len(each) == 4
+
+
+def test_a_steady_recording_belongs_to_the_nearest_light_within_a_third():
+    def lights(*lux):
+        spec = SimpleNamespace(steady=[SimpleNamespace(lux=one) for one in lux])
+        return SimpleNamespace(spec=spec)
+
+    assert figures._steady(lights(0.0, 71.0, 55.0, 100.0), 60.0).lux == 55.0
+    assert figures._steady(lights(60 * 1.29, 0.0), 60.0).lux == 60 * 1.29
+    assert figures._steady(lights(60 / 1.29), 60.0).lux == 60 / 1.29
+    assert figures._steady(lights(60 * 1.34, 60 / 1.34), 60.0) is None
+
+
+def test_intervals_are_drawn_as_a_density():
+    """The area of each bar is the number of its intervals, each of a whole number of µs."""
+    counts = np.random.default_rng(5).poisson(40 / (1 + np.arange(3000) / 60))
+    dead = SimpleNamespace(key="dead_time", value={"value": 130.0})
+    axes = Figure().subplots()
+    drawings._intervals(axes, SimpleNamespace(intervals=counts, entries=[dead]))
+    (bars,) = axes.patches
+    density, edges = bars.get_data()[:2]
+    for value, first, last in zip(density, edges[:-1], edges[1:], strict=True):
+        number = counts[int(first) : int(last)].sum()
+        assert value * (last - first) == pytest.approx(number) if number else np.isnan(value)
+    assert edges[0] == 1 and edges[-1] < 3000 and axes.lines[0].get_xdata()[0] == 130.0
