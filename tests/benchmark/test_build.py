@@ -12,10 +12,10 @@ import time
 import h5py
 import numpy as np
 import pytest
+from steps import Steps
 
 import hesim_render as hr
 from benchmarks import SMALL, generated, small
-from steps import Steps
 from hesim_render import cli
 from hesim_render.benchmark import Benchmark, build_benchmark, local, verify_benchmark
 from hesim_render.benchmark.build import UnfinishedError

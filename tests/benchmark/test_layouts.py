@@ -4,10 +4,10 @@ import h5py
 import numpy as np
 import pytest
 from PIL import Image
+from steps import Steps
 
 import hesim_render as hr
 from benchmarks import small
-from steps import Steps
 from hesim_render.benchmark import build_benchmark
 from hesim_render.benchmark.layouts import cumulative_grid, export_benchmark
 from hesim_render.core.errors import OutputError, RangeError, SpecError

@@ -9,8 +9,7 @@ from ruamel.yaml import YAML
 
 import hesim_render as hr
 from benchmarks import small
-from hesim_render.benchmark import card
-from hesim_render.benchmark import build_benchmark
+from hesim_render.benchmark import build_benchmark, card
 from hesim_render.benchmark.card import card_header, tasks
 from hesim_render.benchmark.shards import pack_benchmark
 from hesim_render.benchmark.tonic_dataset import EventDataset

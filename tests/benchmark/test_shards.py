@@ -8,9 +8,9 @@ import tarfile
 import h5py
 import numpy as np
 import pytest
+from steps import Steps
 
 from benchmarks import small
-from steps import Steps
 from hesim_render.benchmark import build_benchmark
 from hesim_render.benchmark.folder import Benchmark
 from hesim_render.benchmark.layouts import LAYOUTS, export_benchmark

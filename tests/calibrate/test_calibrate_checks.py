@@ -1,11 +1,12 @@
 """Captures that break what the noise models suppose: each is named in the report; good ones are not."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import broken_captures
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, norm
 
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration
 from hesim_render.calibrate.aps import checks as frame_checks
@@ -200,6 +201,26 @@ def test_maps_for_the_report_are_the_counts_of_the_captures(good_events, monkeyp
         wanted = rates[:, k] / rates[:, 3]
         error = np.sqrt(wanted / rates[:, 3]) + 0.04 * wanted
         assert np.all(np.abs(np.interp(rates[:, 0], signal, p) - wanted) < 6 * error)
+
+
+@pytest.mark.parametrize(("on", "off", "named"), [
+    (0.0031, 0.0002, []),  # the leak, and nothing
+    (0.0131, 0.0002, ["ON"]), (0.0031, 0.0102, ["OFF"]), (0.0131, 0.0102, ["ON", "OFF"]), (0.0030, -0.05, []),
+])  # fmt: skip
+def test_a_floor_is_what_steps_of_the_other_direction_give_beyond_leak(on, off, named):
+    """Of ON events the leak of 0.003 ± 0.0004 is taken off, of OFF events nothing; errors of 0.001 each."""
+    fit = SimpleNamespace(
+        free=np.ones(6, bool), values=np.array([1, 1, 1, 1, 0, 0.003]), covariance=np.diag([0, 0, 0, 0, 0, 0.0004**2])
+    )
+    levels = event_checks.CurveLevels((on, 0.001), (off, 0.001), (1.0, 0.001))
+    found = event_checks._floor(SimpleNamespace(together=fit), levels)
+    if not named:
+        assert found is None
+        return
+    values = {"ON": on, "OFF": off}
+    assert " and ".join(f"{values[name]:.2g} ({name})" for name in named) in found.text
+    away = {"ON": abs(on - 0.003) / np.hypot(0.001, 0.0004), "OFF": abs(off) / 0.001}
+    assert found.p_value == pytest.approx(min(4 * norm.sf(away[name]) for name in named), rel=1e-6)
 
 
 def test_searches_that_end_elsewhere_are_told(good_events):

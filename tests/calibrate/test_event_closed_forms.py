@@ -215,6 +215,16 @@ def test_pooled_s_curves_have_the_moments_of_their_law():
     steps = SimpleNamespace(**{**vars(steps), "events": lambda polarity: both[polarity]})
     for s in (1, -1):
         np.testing.assert_allclose(trials_fit.pixel_thresholds(steps, s), centre[s], atol=2e-3)
+    # of several lights the brightest of that polarity, whatever those of the other are
+    lights = {1: 70.0, -1: 41.0}
+    more = [size[:3] * s for s in (1, -1)]
+    unlike = SimpleNamespace(
+        signal_dn=np.concatenate([[lights[s] for s in sign], [31.0] * 3, [17.0] * 3]),
+        contrast=np.concatenate([contrast, *more]), calm=np.concatenate([calm, calm[:6]]),
+        events=lambda polarity: np.concatenate([both[polarity], np.zeros((6, 2, 3))]),
+    )  # fmt: skip
+    for s in (1, -1):
+        np.testing.assert_allclose(trials_fit.pixel_thresholds(unlike, s), centre[s], atol=2e-3)
 
 
 def test_middle_spread_and_leak_of_a_start():

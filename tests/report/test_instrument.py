@@ -5,9 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.report import simulated
+from hesim_render.report import simulated_frames as frames
 from hesim_render.report.simulated import REFERENCE_LUX, Instrument
 
 
@@ -72,7 +74,9 @@ def test_steps_rise_and_fall_by_their_size_at_the_times_of_the_file(tick_us):
     t_us, lux = np.array(stage.seen).T
     half = made._half_us(70.0)
     assert entry["contrast"] == pytest.approx(np.exp(0.35) - 1) and entry["period_us"] == 2 * half
-    assert entry["interval_us"] == [0, 7 * half] and entry["begin_us"] == half and t_us[[0, -1]].tolist() == [0, 7 * half]
+    assert (
+        entry["interval_us"] == [0, 7 * half] and entry["begin_us"] == half and t_us[[0, -1]].tolist() == [0, 7 * half]
+    )
     jumps = half * np.arange(1, 7)
     np.testing.assert_allclose(np.diff(np.log(lux))[np.diff(lux) != 0], 0.35 * np.array([1, -1, 1, -1, 1, -1]))
     assert entry["reset"] is (tick_us is None)
@@ -180,3 +184,62 @@ def test_progress_of_a_bench_rises_to_its_end(monkeypatch):
     assert all(0 < part < 0.8 for part in told)
     first = told[: len(told) // 2]
     assert first == sorted(first)
+
+
+def frame_bench(monkeypatch):
+    """A mosaic of 2 x 3 with event pixels, two red filters and a green one, whose responses peak at 610 and 530 nm."""
+
+    def spectrum(peak, top):
+        grid = np.arange(400.0, 701.0, 10.0)
+        values = top * np.exp(-(((grid - peak) / 40) ** 2))
+        return SimpleNamespace(wavelength_nm=grid, values=values, at=lambda nm: np.interp(nm, grid, values))
+
+    shapes = {"r": spectrum(610, 0.5), "g": spectrum(530, 0.7)}
+    monkeypatch.setattr(frames, "product", lambda filter_, efficiency: filter_)
+    monkeypatch.setattr(frames, "mixed", lambda values, crosstalk: values)
+    aps = SimpleNamespace(full_well_e=9_000.0, black_level_dn=40.0, system_gain_dn_per_e=0.35, bit_depth=12)
+    spec = SimpleNamespace(
+        filters={name: SimpleNamespace(load=lambda one=one: one) for name, one in shapes.items()},
+        quantum_efficiency=SimpleNamespace(load=lambda: None), tile_rows=["EGR", "RER"],
+        pixels={letter: SimpleNamespace(filter=letter.lower() if letter != "E" else "g") for letter in "EGR"},
+        positions=lambda role: [(0, 1), (0, 2), (1, 0), (1, 2)], geometry=SimpleNamespace(fill_factor=0.6),
+    )  # fmt: skip
+    seen = []
+
+    def sample(electrons, exposure_us, seed, number):
+        seen.append((electrons, exposure_us, seed, number))
+        return np.arange(8 * 9).reshape(8, 9).astype(np.uint16)
+
+    noise = SimpleNamespace(spec=aps, full_scale_dn=4095, crosstalk=None, sample=sample)
+    layout = SimpleNamespace(tiled=lambda tile: np.tile(tile, (4, 3)), tile_shape=(2, 3))
+    return SimpleNamespace(spec=spec, aps=noise, layout=layout, name="s"), seen
+
+
+def test_frames_go_from_the_dark_beyond_saturation_with_exposures_in_equal_steps(tmp_path, monkeypatch):
+    """Of the filter that most pixels have, at the wavelength of its peak; two frames a level, lit and dark, and 32."""
+    sensor, seen = frame_bench(monkeypatch)
+    told = []
+    made = frames.FrameInstrument(sensor, tmp_path, 5, lambda what, part: told.append(part))
+    assert (made.filter, made.wavelength_nm) == ("r", 610.0)
+    assert made.record() == tmp_path
+    exposures = np.array([each[1] for each in seen])
+    assert [each[3] for each in seen] == list(range(1, len(seen) + 1)) and {each[2] for each in seen} == {5}
+    # what a pixel of the red filter gets, against its saturation: that of the ADC, (4095 - 40)/0.35
+    electrons = np.array([np.asarray(each[0])[0, 2] for each in seen])
+    pairs, series = electrons[:96].reshape(24, 2, 2), electrons[96:].reshape(2, 32)
+    times = exposures[:96].reshape(24, 2, 2)
+    np.testing.assert_allclose(times[:, 0, 0], np.rint(20_000 * np.arange(1, 25) / 24))
+    assert np.all(times == times[:, :1, :1]) and np.all(pairs[:, 1] == 0) and np.all(series[1] == 0)
+    np.testing.assert_allclose(pairs[-1, 0], 1.1 * min(9_000, 4_055 / 0.35))
+    np.testing.assert_allclose(pairs[:, 0, 0] / times[:, 0, 0], pairs[-1, 0, 0] / 20_000)
+    green = np.asarray(seen[0][0])[0, 1] / np.asarray(seen[0][0])[0, 2]
+    assert green == pytest.approx(0.7 * np.exp(-4) / 0.5)
+    # the series has an exposure of its own, in the middle
+    assert set(exposures[96:]) == {times[11, 0, 0] + 1} and np.ptp(series[0]) == 0
+    assert told == sorted(told) and told[0] == 0 and told[-1] < 1
+    names = sorted(path.name for path in tmp_path.glob("*.png"))
+    assert len(names) == 24 * 4 + 64
+    with Image.open(tmp_path / names[0]) as picture:  # the pixels of the first position of that filter
+        np.testing.assert_array_equal(np.asarray(picture), np.arange(72).reshape(8, 9)[0::2, 2::3])
+    photons = pairs[-1, 0, 0] / (0.5 * 0.6)
+    assert f"lit_20000us_{photons:.2f}ph_01.png" in names and "dark_20000us_02.png" in names
