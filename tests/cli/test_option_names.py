@@ -7,11 +7,12 @@ import pytest
 
 import hesim_render as hr
 from hesim_render.capture import lab
-from hesim_render.cli import calibrate, simulate
+from hesim_render.cli import calibrate, measure, simulate
 from hesim_render.cli.commands import program
 from hesim_render.cli.options import in_options
 from hesim_render.cli.terminal import parse_exposures
 from hesim_render.core.errors import ConflictError, RangeError, SpecError
+from hesim_render.measure import measure_mtf
 
 
 @pytest.mark.parametrize(("given", "name", "option"), [
@@ -64,6 +65,7 @@ def test_switches_are_off_until_they_are_given():
 @pytest.mark.parametrize(("command", "function", "names"), [
     (calibrate.lab, lab.write_captures, {"frames", "ticks", "trials", "seed", "parts", "illuminant"}),
     (simulate.simulate, hr.simulate, set()),
+    (measure.measure, measure_mtf, {"frame", "signal"}),
 ])  # fmt: skip
 def test_options_have_the_defaults_of_the_functions(command, function, names):
     told, own = (inspect.signature(inspect.unwrap(each)).parameters for each in (command, function))
