@@ -698,3 +698,27 @@ def test_trials_are_counted_by_kind_bin_and_part(tmp_path):
         after == steps[kind][1] or after == pytest.approx(steps[kind][1])
         for kind, (_, after) in zip(kinds, lights, strict=True)
     )
+
+
+def test_steps_of_a_plan_reach_parts_of_both_thresholds():
+    """x = β1 I + β2: from each light, ln x₁/x₀ goes in equal steps from a quarter to 1.9 thresholds, up and down; where
+    the light would end below a thousandth of itself the step is left out."""
+    first = SimpleNamespace(beta1=0.04, beta2=0.9)
+    spec = SimpleNamespace(
+        photoreceptor_cutoff_hz=170.0, coefficients=[first], contrast_threshold_on=0.21, contrast_threshold_off=0.34
+    )
+    plans = lab_trials.plan_trials(SimpleNamespace(spec=spec), 6)
+    steps = plans["evs_s_curve"]
+    assert np.all(steps.trials == 6) and steps.signal_dn.size == steps.contrast.size == steps.trials.size
+    before = 0.04 * steps.signal_dn + 0.9
+    change = np.log((0.04 * steps.signal_dn * np.exp(steps.contrast) + 0.9) / before)
+    for light in np.unique(steps.signal_dn):
+        for sign, theta in ((1, 0.21), (-1, 0.34)):
+            own = change[(steps.signal_dn == light) & (np.sign(steps.contrast) == sign)] * sign / theta
+            assert own[0] == pytest.approx(0.25) and np.ptp(np.diff(own)) < 1e-9 and own[-1] <= 1.9 + 1e-9
+            next_one = (0.04 * light + 0.9) * np.exp(sign * theta * (own[-1] + np.diff(own)[0]))
+            assert own[-1] == pytest.approx(1.9) or (next_one - 0.9) / 0.04 < 1e-3 * light
+    period_us = 1e6 / 170
+    assert steps.settle_us == np.ceil(0.75 * period_us)
+    assert steps.edges_us.tolist() == [0, np.ceil(0.03 * period_us), np.ceil(1.25 * period_us)]
+    assert plans["evs_noise_rate"].edges_us.tolist() == [0, np.ceil(20 * period_us)]

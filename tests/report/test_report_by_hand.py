@@ -366,3 +366,16 @@ def test_pixels_that_are_hot_or_dead_in_either_polarity_are_left_out(monkeypatch
         figures.event_figures(None)
     assert [each[:2] for each in seen] == [("one", 0), ("one", 1)]
     assert all(np.flatnonzero(~good).tolist() == [1, 3, 6] for _, _, good in seen)
+
+
+def test_what_an_s_curve_lacks_is_said():
+    """Each beside its limit: 20 pixels, 4 contrasts, a largest share of 3/4, a least of 1/4, 2 points on the slope."""
+    size, share = np.array([0.1, 0.2, 0.3, 0.4]), np.array([0.24, 0.5, 0.7, 0.76])
+    assert s_curves._problem(size, share, 20) == ""
+    assert s_curves._problem(size, share, 19).startswith("19 pixels answer; 20")
+    assert s_curves._problem(size[1:], share[1:] - 0.3, 20).startswith("steps of 3 contrasts at this light; 4")
+    assert s_curves._problem(size, np.minimum(share, 0.74), 20).startswith("the largest step is answered in 0.74")
+    assert s_curves._problem(size, np.maximum(share, 0.26), 20).startswith("the smallest step is answered in 0.26")
+    steep = s_curves._problem(size, np.array([0.01, 0.02, 0.96, 0.98]), 20)
+    assert steep and "0.2" in steep and "0.3" in steep
+    assert s_curves._problem(size, np.array([0.01, 0.04, 0.96, 0.98]), 20) == ""

@@ -425,10 +425,10 @@ def test_events_count_only_against_sets_that_have_event_pixels():
            "delta_e_noisy_noise_aware_simulated": 3.0, "delta_e_noisy_noise_aware_low": 2.9,
            "delta_e_noisy_noise_aware_high": 3.1}  # fmt: skip
     table = Table([
-        {**row, "filter_set": "designed", "event_contrast_on": 0.3},
+        {**row, "filter_set": "designed", "event_contrast_on": 0.3, "mtf50_cy_per_px": 0.41},
         {**row, "filter_set": "with", "event_contrast_on": 0.5, "ysnr_simulated": 4.0,
-         "ysnr_noise_aware_simulated": 7.5},
-        {**row, "filter_set": "without"},
+         "ysnr_noise_aware_simulated": 7.5, "mtf50_cy_per_px": 0.57},
+        {**row, "filter_set": "without", "mtf50_cy_per_px": 0.63},
     ])  # fmt: skip
     both, frames_alone = _verdicts(spec, table)
     assert both["ysnr_noise_aware_ratio_20_lux"] == pytest.approx(6.0 / 7.5)
@@ -437,6 +437,7 @@ def test_events_count_only_against_sets_that_have_event_pixels():
         -0.4
     )
     assert frames_alone["cost"] == frames_alone["cost_against"] == pytest.approx(1.7 * 1.3 + 1.5)
+    assert (both["mtf50_cy_per_px"], both["mtf50_cy_per_px_against"]) == (0.41, 0.57)
     half = 0.5 * 0.1 * np.sqrt(2)
     assert both["cost_difference_high"] - both["cost_difference_low"] == pytest.approx(2 * half)
 
