@@ -273,14 +273,15 @@ def test_pages_of_the_pdf_hold_their_lines(monkeypatch):
 
     monkeypatch.setattr(made, "_line", note)
     made.text("A title", 15.0, True)
-    for _ in range(7):
-        made.text("some words of a paragraph " * 40)
+    made.text("some words of a paragraph " * 40)
+    for k in range(330):
+        made.text(f"line {k}", (8.0, 10.5, 6.3, 15.0, 8.0, 9.1, 12.4)[k % 7])
     cells = [(f"cell {k}", "a long text of a cell that takes several lines " * (1 + k % 3)) for k in range(44)]
     made.table(SimpleNamespace(title="A table", head=("name", "what"), rows=cells, widths=(1.0, 3.0)))
     places = []
     made.drawings([lambda axes: places.append((made.count, axes.get_position().bounds))] * 5)
     made.close()
-    assert made.count >= 2
+    assert made.count >= 7
     for page in range(1, made.count + 1):
         own = [line for line in lines if line[0] == page]
         assert all(y <= 842 - 42 and y - 1.32 * size >= 42 - 1e-6 for _, _, y, size, _ in own)
