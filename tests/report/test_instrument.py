@@ -243,3 +243,69 @@ def test_frames_go_from_the_dark_beyond_saturation_with_exposures_in_equal_steps
         np.testing.assert_array_equal(np.asarray(picture), np.arange(72).reshape(8, 9)[0::2, 2::3])
     photons = pairs[-1, 0, 0] / (0.5 * 0.6)
     assert f"lit_20000us_{photons:.2f}ph_01.png" in names and "dark_20000us_02.png" in names
+
+
+@pytest.mark.parametrize(("half_us", "length_us"), [(90_000, 1_000_000), (700_000, 2_800_000)])
+def test_one_light_is_recorded_long_enough_and_counts_its_worst_answers(half_us, length_us, monkeypatch):
+    """Steps of each size, then steady light for a second, or four half periods where those are longer."""
+    made, shares, steps = bench(pixels()), iter([0.97, 0.4, 0.8, 0.9]), []
+    made._content["steady"] = []
+    made._half_us = lambda lux: half_us
+    made._steps = lambda *given: steps.append(given)
+    recorded = SimpleNamespace(spec=SimpleNamespace(steps=[5, 6]), pixels=4, answers_to=lambda last: last)
+    made._written = lambda: recorded
+
+    def told(one, polarity, every, window):
+        assert one == 6 and every.tolist() == [True] * 4 and window is None
+        return SimpleNamespace(share=next(shares))
+
+    monkeypatch.setattr(simulated, "answers", told)
+    assert made._one_light(33.0, [0.5, 0.7]) == 0.4
+    assert steps == [(33.0, 0.5, 2), (33.0, 0.7, 2)]
+    assert made._content["steady"] == [{"file": "steady-33lx", "lux": 33.0, "interval_us": [0, length_us]}]
+    (stage,) = made.stages
+    assert stage.seen == [(0, 33.0), (length_us, 33.0)]
+
+
+def test_coarse_curves_are_read_at_20_50_and_80_percent():
+    """Shares of rises and falls on lines between the steps; a share that falls back counts as the largest so far."""
+    made, size = bench(pixels()), [0.1, 0.2, 0.3, 0.5]
+    rises, falls = [0.0, 0.4, 0.3, 1.0], [0.1, 0.5, 0.9, 0.9]
+
+    def one(k):
+        share = {0: rises[k], 1: falls[k]}
+        return SimpleNamespace(size=size[k], of=lambda polarity: (np.arange(10) < 10 * share[polarity]).astype(int))
+
+    made._written = lambda: SimpleNamespace(responses=[one(k) for k in range(4)])
+    found = made._coarse_curves()
+    np.testing.assert_allclose(found[0], [0.15, 0.3 + 0.2 * 0.1 / 0.6, 0.3 + 0.2 * 0.4 / 0.6], atol=1e-6)
+    np.testing.assert_allclose(found[1], [0.125, 0.2, 0.275], atol=1e-6)
+
+
+@pytest.mark.parametrize("tick_us", [None, 170])
+def test_a_session_goes_from_coarse_to_fine_steps_to_other_lights(tick_us, monkeypatch, tmp_path):
+    """Fine steps lie about the middle of the coarse curve, in widths of it; then steps of two thresholds as found."""
+    made, steps, told = bench(pixels(tick_us=tick_us)), [], []
+    made._folder, made._content = tmp_path, {"busy": [], "steps": []}
+    made._progress = lambda what, part: told.append(part)
+    made._steps = lambda lux, size, periods: steps.append((lux, size, periods))
+    made._coarse_curves = lambda: [(0.2, 0.25, 0.285), (0.28, 0.33, 0.331)]
+    made._written = lambda: SimpleNamespace(pixels=3, responses=None)
+    made._write = lambda: None
+    thetas = iter([0.26, 0.34])
+    monkeypatch.setattr(simulated, "s_curve", lambda *given: SimpleNamespace(theta=next(thetas)))
+    pairs = []
+    made._lights, made._modulations = pairs.extend, lambda theta: told.append(theta)
+    assert made.record() == tmp_path
+    theta = 0.27
+    assert {lux for lux, _, _ in steps} == {REFERENCE_LUX}
+    coarse = [size / theta for _, size, periods in steps if periods == 2]
+    fine = np.array([size for _, size, periods in steps if periods == 6]).reshape(2, 7)
+    assert coarse[0] == pytest.approx(0.02) and coarse == sorted(coarse) and min(coarse) < 0.5 and max(coarse) == 2
+    # the width of a normal law between 20 and 80 % is 1/1.683; at least 3 % and at most 20 % of the middle
+    assert fine[:, 3] == pytest.approx([0.25, 0.33])
+    widths = (fine[:, 5] - fine[:, 3]) / 1.5
+    assert widths == pytest.approx([0.085 / 1.7, 0.051 / 1.7])
+    np.testing.assert_allclose(fine - fine[:, 3:4], -(fine - fine[:, 3:4])[:, ::-1], atol=1e-12)
+    assert pairs == pytest.approx([0.52, 0.68]) and told[-2] == pytest.approx(theta)
+    assert told[0] < told[-3] < told[-1] < 1 and len(made._content["busy"]) == 2
