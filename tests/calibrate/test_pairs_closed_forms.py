@@ -250,3 +250,24 @@ def test_outliers_lie_eight_deviations_from_what_is_around_them():
     image[50, 60] += 5.5
     assert np.argwhere(spatial.outliers(image, (0.0, 0.0, 0.5))).tolist() == [[20, 30], [41, 7]]
     assert not spatial.outliers(image, (0.0, 0.0, 3.0)).any()  # 8 · 1.73 is more than 11 and a deviation
+
+
+def test_only_frequencies_that_stand_out_of_an_image_are_its_waves():
+    """Pixels with a spread of 2 DN, far more than the noise of their mean, are no wave; a sine of 1.1 DN is one, less
+    what noise adds to its power."""
+    rng, (rows, cols), noise = np.random.default_rng(6), (60, 88), 0.09
+    pixels = 2 * rng.standard_normal((rows, cols))
+    pixels += pixels.mean() - pixels.mean(axis=0) - pixels.mean(axis=1, keepdims=True)
+    np.testing.assert_array_equal(spatial._waves(pixels, noise, None, 12), 0)
+    at_row, at_col = np.mgrid[:rows, :cols]
+    sine = 1.1 * np.cos(2 * np.pi * (7 / rows * at_row + 13 / cols * at_col) + 0.4)
+    found = spatial._waves(pixels + sine, noise, None, 12)
+    share = np.fft.rfft2(pixels + sine)[7, 13]
+    power = np.abs(share) ** 2 / (rows * cols)
+    wanted = np.zeros((rows, cols // 2 + 1), complex)
+    wanted[7, 13] = share * np.sqrt(1 - noise / power)
+    np.testing.assert_allclose(found, np.fft.irfft2(wanted, (rows, cols)), atol=1e-9)
+    assert np.corrcoef(found.ravel(), sine.ravel())[0, 1] > 0.99
+    # interference of that size at that frequency is noise of the mean of 12 frames: what is left of it is no wave
+    hum = noise_spectrum.InterferenceLine(7 / rows, 13 / cols, 1.1 / np.sqrt(2) * np.sqrt(12))
+    np.testing.assert_array_equal(spatial._waves(pixels + sine, noise, SimpleNamespace(lines=[hum]), 12), 0)

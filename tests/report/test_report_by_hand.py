@@ -303,6 +303,7 @@ def test_pages_of_the_pdf_hold_their_lines(monkeypatch):
         left * 595 > 42 and (left + bounds[2]) * 595 < 553 for left, (_, bounds) in zip(lefts, places, strict=True)
     )
     assert all(bottom * 842 > 42 for bottom in bottoms)
+    assert bottoms[:3] == [bottoms[0]] * 3 and bottoms[3:] == [bottoms[3]] * 2
     if places[0][0] == places[3][0]:
         assert (bottoms[0] - bottoms[3]) * 842 == pytest.approx(158)
 

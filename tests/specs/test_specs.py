@@ -1,5 +1,6 @@
 """Sensor and scene files: what ships is complete, and every mistake names file, line and key."""
 
+import math
 import re
 import typing
 import warnings
@@ -397,3 +398,25 @@ def test_a_threshold_that_would_make_billions_of_events_is_refused():
     with pytest.raises(SpecError, match=r"evs\.contrast_threshold_off.*at least 0.0001 with reference 'last_event'"):
         read_sensor("davis346", {"evs.contrast_threshold_off": 1e-6})
     assert read_sensor("eiger", {"evs.contrast_threshold_off": 1e-6}).evs.contrast_threshold_off == 1e-6
+
+
+def every_section(kind=Strict):
+    for child in kind.__subclasses__():
+        yield child
+        yield from every_section(child)
+
+
+def test_what_must_be_more_than_a_limit_must_be_more_than_nothing():
+    """Strict lower limits of numbers in files are 0, but for angles above -45°; defaults lie within their limits."""
+    strict, count = set(), 0
+    for section in set(every_section()):
+        for name, field in section.model_fields.items():
+            limits = {key: getattr(part, key) for part in field.metadata for key in ("gt", "ge", "lt", "le")
+                      if hasattr(part, key)}  # fmt: skip
+            strict |= {limits["gt"]} if "gt" in limits else set()
+            if limits and isinstance(field.default, (int, float)):
+                count += 1
+                where = f"{section.__name__}.{name}"
+                assert limits.get("gt", -math.inf) < field.default < limits.get("lt", math.inf), where
+                assert limits.get("ge", -math.inf) <= field.default <= limits.get("le", math.inf), where
+    assert strict <= {0, -45} and 0 in strict and count > 60
