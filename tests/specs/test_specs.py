@@ -420,3 +420,38 @@ def test_what_must_be_more_than_a_limit_must_be_more_than_nothing():
                 assert limits.get("gt", -math.inf) < field.default < limits.get("lt", math.inf), where
                 assert limits.get("ge", -math.inf) <= field.default <= limits.get("le", math.inf), where
     assert strict <= {0, -45} and 0 in strict and count > 60
+
+
+def is_round(value):
+    """One digit and zeros, or a power of two, or one less."""
+    digits = f"{abs(value):.15g}".replace(".", "").partition("e")[0].strip("0")
+    whole = int(value) if float(value).is_integer() else None
+    return len(digits) <= 1 or (whole is not None and (whole & (whole - 1) == 0 or whole & (whole + 1) == 0))
+
+
+#: Limits that are no round numbers, and why: a half or a right angle, a fisheye's field, an hour and a minute, degrees
+#: Celsius of electronics and ovens, wavelengths of visible light, a lens, a signal of a thin line.
+OTHER_LIMITS = {90, 45, 170, 3600, 60, 125, 360, 830, 720, -45, 0.45, -0.45, 300, 200}
+
+
+def test_limits_and_defaults_of_numbers_are_round():
+    """So that a slip of a digit shows. Defaults have two digits at most, but for the sides of a ColorChecker and the
+    refractive index of glass."""
+    count = 0
+    for section in set(every_section()):
+        for name, field in section.model_fields.items():
+            where = f"{section.__name__}.{name}"
+            for part in field.metadata:
+                for key in ("gt", "ge", "lt", "le"):
+                    if hasattr(part, key):
+                        count += 1
+                        limit = getattr(part, key)
+                        assert is_round(limit) or limit in OTHER_LIMITS, f"{where}: {limit}"
+                        if name.endswith("_dn") and key == "le" and section.__name__ in ("ApsSpec", "InterferenceSpec"):
+                            assert limit == 2**16 - 1, where
+            if isinstance(field.default, float) and (section.__name__, name) not in (
+                ("ColorCheckerTarget", "width_m"), ("ColorCheckerTarget", "height_m"), ("ThinFilmSpec", "substrate"),
+            ):  # fmt: skip
+                digits = f"{abs(field.default):.15g}".replace(".", "").partition("e")[0].strip("0")
+                assert len(digits) <= 2, f"{where}: {field.default}"
+    assert count > 350
