@@ -35,6 +35,10 @@ def test_the_error_of_a_mean_has_parts_of_pixels_and_of_jumps():
     alone[0] = 1, -1
     assert mean_error(alone, np.ones((2, 2), bool)) == pytest.approx(np.sqrt(2) / 4)
     assert np.isnan(mean_error(alone, np.eye(2, dtype=bool) & False))
+    # two values are enough: those of two pixels and one jump, 3 apart, are 1.5/√2 off; one is not
+    few = np.array([[2.0, 5.0], [7.0, 7.0]])
+    assert mean_error(few, np.array([[True, True], [False, False]])) == pytest.approx(1.5 / np.sqrt(2))
+    assert np.isnan(mean_error(few, np.array([[True, False], [False, False]])))
 
 
 def test_a_quantile_has_the_interval_of_the_share_below_it():
