@@ -105,6 +105,18 @@ _FORMS = "tests/calibrate/test_calibration_closed_forms.py"
 #: Mutations that no test noticed once.
 FIXED = (
     Fixed(
+        "event probability: the asymmetry after the mean over thresholds",
+        "v = over_thresholds(own, cells.relative, cells.spread, NUMPY)",
+        "v = (1 - cells.polarity * rho) * over_thresholds(u, cells.relative, cells.spread, NUMPY)",
+        ("tests/calibrate/test_event_closed_forms.py",),
+    ),
+    Fixed(
+        "interference: a floor without the filter of the read-out",
+        "floor = _floor(inside, (rows, cols), frames - 1, highest)",
+        "floor = np.full(inside.shape, np.median(inside))",
+        ("tests/calibrate/test_pairs_closed_forms.py",),
+    ),
+    Fixed(
         "variance polynomial: no correction for the noise of the signals",
         "result[:, n] += (-1) ** j * count * tau**j * sums[:, n - 2 * j]",
         "result[:, n] += 0 * sums[:, n - 2 * j]",

@@ -56,12 +56,16 @@ def spectrum(image: NDArray, noise_pixel: float, noise_shared: float, axis: int)
     banded = np.array([power[group].mean() for group in groups])
     noise = noise_pixel + noise_shared
     pattern = np.maximum(banded - noise, 0.0)
+    # noise that lines share beats with what their patterns share, and not with what is a line's own
+    mean = np.abs(transform.mean(axis=0)) ** 2 / size
+    common = np.array([mean[group].mean() for group in groups]) - noise_pixel / count - noise_shared
+    common = np.maximum(common, 0.0)
     number = np.array([float(group.size) for group in groups])
     if size % 2 == 0:  # half a period a pixel has a real amplitude, and its power twice the variance
         number[-1] **= 2
         number[-1] /= groups[-1].size + 1
     own = (2 * pattern * noise_pixel + noise_pixel**2) / (count * number)
-    shared = (2 * pattern * noise_shared + noise_shared**2 + 2 * noise_pixel * noise_shared / count) / number
+    shared = (2 * common * noise_shared + noise_shared**2 + 2 * noise_pixel * noise_shared / count) / number
     cycles = np.array([(group.mean() + 1) / size for group in groups])
     return SpatialSpectrum(cycles, banded, np.sqrt(own + shared))
 

@@ -12,6 +12,7 @@ import time
 import h5py
 import numpy as np
 import pytest
+from steps import Steps
 
 import hesim_render as hr
 from benchmarks import SMALL, generated, small
@@ -151,7 +152,9 @@ def test_a_killed_worker_leaves_the_same_bytes(built, tmp_path):
         again = build_benchmark(spec, root, workers=2, estimate=False)
     assert killed and digest_of(again) == digest_of(built)
     assert (root / "benchmark.json").read_bytes() == (built.root / "benchmark.json").read_bytes()
-    assert verify_benchmark(root) == []
+    told = Steps()
+    assert verify_benchmark(root, progress=told) == []
+    assert len(told) >= 2 and told[-1][0] == told[-1][1] == 2
 
 
 def test_a_build_goes_on_where_it_was(built, tmp_path):

@@ -7,19 +7,30 @@ from pathlib import Path
 
 import pytest
 
-from hesim_render.benchmark import worker
 from hesim_render.benchmark.worker import VISIBLE, claim_device, devices_of
 
+#: Loads the module once, and starts a process for each line that it reads; "PID" ends that process.
 CODE = """
-import importlib.util, sys
+import os, signal, sys
 from pathlib import Path
-spec = importlib.util.spec_from_file_location("devices", sys.argv[2])  # alone, without what the package needs
-module = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(module)
-claim_device = module.claim_device
-found = {"CUDA_VISIBLE_DEVICES": "0,1,GPU-8f"}
-print(claim_device(found, locks=Path(sys.argv[1])), found["CUDA_VISIBLE_DEVICES"], flush=True)
-sys.stdin.read()
+from hesim_render.benchmark.worker import claim_device
+
+workers = []
+for line in sys.stdin:
+    if line.strip():
+        os.kill(int(line), signal.SIGKILL)
+        os.waitpid(int(line), 0)
+        workers.remove(int(line))
+        print("gone", flush=True)
+        continue
+    workers.append(os.fork())
+    if workers[-1] == 0:
+        found = {"CUDA_VISIBLE_DEVICES": "0,1,GPU-8f"}
+        print(os.getpid(), claim_device(found, locks=Path(sys.argv[1])), found["CUDA_VISIBLE_DEVICES"], flush=True)
+        while True:
+            signal.pause()
+for worker in workers:
+    os.kill(worker, signal.SIGKILL)
 """
 
 
@@ -36,30 +47,27 @@ def test_the_environment_comes_before_the_driver(tmp_path):
 def test_workers_take_different_gpus_and_a_dead_one_gives_its_own_back(tmp_path):
     """Three processes have three GPUs; a fourth shares one; after a kill its GPU is free again."""
 
-    def start():
-        process = subprocess.Popen(
-            [sys.executable, "-c", CODE, str(tmp_path), worker.__file__],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        device, visible = process.stdout.readline().split()
-        assert device == visible
-        return process, device
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": environment}
+    with subprocess.Popen([sys.executable, "-c", CODE, str(tmp_path)], **pipes) as parent:
 
-    workers = [start() for _ in range(3)]
-    try:
+        def answer(line=""):
+            parent.stdin.write(line + "\n")
+            parent.stdin.flush()
+            return parent.stdout.readline().split()
+
+        def start():
+            worker, device, visible = answer()
+            assert device == visible
+            return worker, device
+
+        workers = [start() for _ in range(3)]
         assert [device for _, device in workers] == ["0", "1", "GPU-8f"]
-        workers.append(start())
-        assert workers[3][1] in ("0", "1", "GPU-8f")
-        workers[1][0].kill()
-        workers[1][0].wait()
-        workers.append(start())
-        assert workers[4][1] == "1"
-    finally:
-        for process, _ in workers:
-            process.kill()
-            process.communicate()
+        assert len({worker for worker, _ in workers}) == 3
+        assert start()[1] in ("0", "1", "GPU-8f")
+        assert answer(workers[1][0]) == ["gone"]
+        assert start()[1] == "1"
+    assert parent.returncode == 0
 
 
 def test_the_recipe_for_slurm_asks_for_what_workers_need():

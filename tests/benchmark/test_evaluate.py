@@ -2,13 +2,15 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
+from steps import Steps
 
 from benchmarks import small
-from hesim_render.benchmark import Benchmark, build_benchmark, evaluate_benchmark
+from hesim_render.benchmark import Benchmark, build_benchmark, evaluate_benchmark, tasks
 from hesim_render.benchmark.evaluate import NOTHING, score_summary, score_table, verdicts
 from hesim_render.benchmark.pictures import ClipDevelopment
 from hesim_render.benchmark.predictions import Predictions
@@ -31,7 +33,10 @@ def built(tmp_path_factory):
 
 
 def test_every_task_has_scores(built, tmp_path):
-    result = evaluate_benchmark(built.root, out=tmp_path / "r.json")
+    told = Steps()
+    result = evaluate_benchmark(built.root, out=tmp_path / "r.json", progress=told)
+    told.count()
+    assert len(told) == 1
     found = result["summary"]
     assert set(found["deblur"]) == {"blurred", "double-integral"}
     assert set(found["interpolate"]) == {"hold", "average", "double-integral"}
@@ -162,6 +167,41 @@ def test_pictures_hold_dn_or_parts_of_the_full_scale(tmp_path):
         again.read("deblur", "a", 0, (7, 5), 4095)
     with pytest.raises(SpecError, match=r"holds float64 \[5, 7\]; expected numbers \[5, 7, 3\]"):
         again.read("deblur", "a", 0, (5, 7, 3), 4095)
+
+
+def test_exposures_are_merged_at_the_middle_of_the_shortest(monkeypatch):
+    """Three clips: the truth is the sharp image at that middle, if it is near in parts of the longest exposure."""
+    flux = {300: 5.0, 3_000: 7.0, 20_000: 11.0}
+
+    def clip(exposure_us, count):
+        frames = [SimpleNamespace(exposure_start_us=9_000 * k, exposure_us=exposure_us, raw=k) for k in range(count)]
+        return SimpleNamespace(name="c", recording=SimpleNamespace(frames=frames, mosaic=None))
+
+    def exposure(raw, exposure_us, aps, mosaic):
+        return SimpleNamespace(flux=flux[exposure_us] + raw)
+
+    clips = [clip(300, 4), clip(3_000, 3), clip(20_000, 5)]
+    times = np.array([150.0, 4_000.0, 9_000 + 150 + 5_001.0, 18_150.0])
+    clips[0].sharp = SimpleNamespace(
+        time_us=times, nearest=lambda t_us: int(np.argmin(np.abs(times - t_us))), flux_e_per_s=np.array
+    )
+    monkeypatch.setattr(tasks, "flux_of", exposure)
+    monkeypatch.setattr(tasks, "merged_exposures", lambda given: tuple(each.flux for each in given))
+    monkeypatch.setattr(tasks, "flux_scores", lambda value, truth, valid: {"value": value, "truth": truth})
+    made = tasks.ClipTasks.__new__(tasks.ClipTasks)
+    made._clip, made._longer, made._predictions = clips[0], clips[1:], None
+    made._development = SimpleNamespace(sensor=SimpleNamespace(aps=1), layout=SimpleNamespace(aps_mask=None))
+    # of the second frame no image is near: 5150 and 5001 µs away from 9150 of a longest exposure of 20000
+    found = {(score.item, score.method): (score.values["value"], score.values["truth"]) for score in made.hdr()}
+    assert found == {
+        (item, method): (value, truth)
+        for item, truth in ((0, 0), (2, 3))
+        for method, value in (
+            ("shortest", 5.0 + item), ("longest", 11.0 + item), ("merge", (5.0 + item, 7.0 + item, 11.0 + item))
+        )
+    }  # fmt: skip
+    made._longer = ()
+    assert list(made.hdr()) == []
 
 
 @pytest.mark.slow

@@ -1,13 +1,16 @@
 """Layouts of other programs, walked as their loaders walk them; voxel grids against their definitions; the loader."""
 
+from types import SimpleNamespace
+
 import h5py
 import numpy as np
 import pytest
 from PIL import Image
+from steps import Steps
 
 import hesim_render as hr
 from benchmarks import small
-from hesim_render.benchmark import build_benchmark
+from hesim_render.benchmark import build_benchmark, layouts
 from hesim_render.benchmark.layouts import cumulative_grid, export_benchmark
 from hesim_render.core.errors import OutputError, RangeError, SpecError
 from hesim_render.pixels.evs.events import EVENT_DTYPE
@@ -130,11 +133,32 @@ def test_an_export_appears_whole_or_not_at_all(built, tmp_path):
     export_benchmark(built.root, "raw-npz", tmp_path / "x")
     with pytest.raises(OutputError, match="overwrite"):
         export_benchmark(built.root, "raw-npz", tmp_path / "x")
-    export_benchmark(built.root, "hs-ergb", tmp_path / "x", overwrite=True)
+    told = Steps()
+    export_benchmark(built.root, "hs-ergb", tmp_path / "x", overwrite=True, progress=told)
+    told.count()
+    assert len(told) == len(list(built.clips()))
     assert (tmp_path / "x" / "layout.txt").read_text() == "hs-ergb\n"
     with pytest.raises(SpecError):
         export_benchmark(tmp_path, "hs-ergb", tmp_path / "y")
     assert not (tmp_path / "y").exists()
+
+
+def test_pictures_are_srgb_of_the_exposure_of_the_first():
+    """Of which a half percent of values is above 0.95; by the piecewise function of IEC 61966-2-1, in whole steps."""
+    rng = np.random.default_rng(3)
+    light = rng.uniform(0, 2.4, (3, 30, 40, 3))
+    light[1, 0, 0], light[1, 0, 1] = 99.0, -0.3
+    made = layouts._Clip.__new__(layouts._Clip)
+    made.development, made._gain = SimpleNamespace(linear=lambda number: light[number]), None
+    made.picture(0)
+    found = made.picture(1)
+    linear = np.clip(light[1] * 0.95 / np.percentile(light[0], 99.5), 0, 1)
+    wanted = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    np.testing.assert_array_equal(found, np.rint(255 * wanted))
+    assert found.dtype == np.uint8 and found[0, 0].tolist() == [255] * 3 and found[0, 1].tolist() == [0] * 3
+    dark = layouts._Clip.__new__(layouts._Clip)
+    dark.development, dark._gain = SimpleNamespace(linear=lambda number: 0 * light[number]), None
+    assert dark.picture(2).max() == 0
 
 
 # ---- voxels -------------------------------------------------------------------------------------------

@@ -23,16 +23,22 @@ def test_planes_through_the_events_of_an_edge_have_its_speed(angle_deg):
     time = (way[0] * x + way[1] * y) / speed
     time = time - time.min() + 5000
 
-    def events_at(when):
+    def events_at(when, polarity=1):
         order = np.argsort(when, axis=None)
         made = np.zeros(order.size, EVENT_DTYPE)
         made["t_us"], made["x"], made["y"] = np.rint(when.ravel()[order]), x.ravel()[order], y.ravel()[order]
-        made["polarity"] = 1
+        made["polarity"] = polarity
         return made
 
     found = plane_fit(events_at(time), (rows, cols))
     inner = found[3:-3, 3:-3]
     assert np.isfinite(inner).all() and np.abs(inner - speed * way).max() < 0.01 * speed
+    # events of the other polarity have planes of their own; those of both are not mixed
+    np.testing.assert_array_equal(plane_fit(events_at(time, -1), (rows, cols)), found)
+    far = events_at(time, -1)[: time.size // 9]
+    far["t_us"] -= 4_000
+    both = np.concatenate([far, events_at(time)])
+    np.testing.assert_array_equal(plane_fit(both, (rows, cols))[3:-3, 3:-3], inner)
     rng = np.random.default_rng(3)
     noisy = plane_fit(events_at(time + rng.normal(0, 100, time.shape)), (rows, cols))[3:-3, 3:-3]
     # the slope of a plane through 25 times of σ 100 µs has σ 100/√50 = 14 µs/px, 3 % of 500 µs/px

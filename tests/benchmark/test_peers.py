@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from steps import Steps
 
 import hesim_render as hr
 from hesim_render import cli
@@ -186,7 +187,10 @@ def light(monkeypatch):
 
 def test_an_ideal_peer_agrees_and_coarse_pictures_cost_events(spec, light, tmp_path):
     """500 pictures/s of a wave of 40 Hz; the ideal pixel interpolates ln Φ between them, within 0.003 of it."""
-    result = compare_peers(spec, tmp_path / "r.json", run_programs=True)
+    told = Steps()
+    result = compare_peers(spec, tmp_path / "r.json", run_programs=True, progress=told)
+    told.count(last=1)  # our own events come first, then those of one rate of pictures
+    assert told[0][:2] == (1, 2)
     rows = {row["peer"]: row for row in result["rows"]}
     assert rows[peers.OURS]["count_error"] == 0 and rows[peers.OURS]["timing_us"] == 0
     ideal, coarse = rows["ideal"], rows["coarse"]

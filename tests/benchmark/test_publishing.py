@@ -9,7 +9,7 @@ from ruamel.yaml import YAML
 
 import hesim_render as hr
 from benchmarks import small
-from hesim_render.benchmark import build_benchmark
+from hesim_render.benchmark import build_benchmark, card
 from hesim_render.benchmark.card import card_header, tasks
 from hesim_render.benchmark.shards import pack_benchmark
 from hesim_render.benchmark.tonic_dataset import EventDataset
@@ -64,6 +64,19 @@ def test_the_card_begins_with_the_header_that_hubs_read(built):
     assert values["pretty_name"] == "small" and values["size_categories"] == ["n<1K"]
     assert values["task_categories"] == ["image-to-image", "depth-estimation", "image-segmentation"]
     assert "event-camera" in values["tags"] and body.startswith("\n# small\n")
+
+
+def test_figures_of_the_card_are_those_of_the_clips(built, monkeypatch):
+    """Smallest, median and largest over the clips, decades of the range, and how many have none."""
+    clips = [clip.content for clip in built.clips()]
+    named = dict.fromkeys(card.FIGURES)
+    told = {"min": 0.02, "median": 0.5, "max": 40.0, "decades": 3.3, "zero": 0}
+    monkeypatch.setattr(card, "spread", lambda _: {name: {**told, "zero": 7 * k} for k, name in enumerate(named)})
+    text = card.card(built.manifest, clips)
+    rows = [line for line in text.splitlines() if line.startswith(tuple(f"| `{name}`" for name in named))]
+    for k, (name, row) in enumerate(zip(named, rows, strict=True)):
+        more = f", {7 * k} clips with 0" if k else ""
+        assert row == f"| `{name}` | 0.02 | 0.5 | 40 | 3.3 | {card.FIGURES[name]}{more} |"
 
 
 def test_shards_tell_hubs_the_files_of_each_split(built, tmp_path):

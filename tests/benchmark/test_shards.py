@@ -8,6 +8,7 @@ import tarfile
 import h5py
 import numpy as np
 import pytest
+from steps import Steps
 
 from benchmarks import small
 from hesim_render.benchmark import build_benchmark
@@ -80,8 +81,12 @@ def test_shards_hold_every_sample_once_with_the_same_bytes(built, tmp_path, kind
         pytest.importorskip("fsspec")
     target = {"folder": tmp_path / "x", "file": f"file://{tmp_path}/y", "memory": "memory://shards/z"}[kind]
     # so small that each sample closes its shard
-    assert pack_benchmark(built.root, target, shard_mb=1e-6) == 6
-    assert verify_shards(target) == []
+    packed, checked = Steps(), Steps()
+    assert pack_benchmark(built.root, target, shard_mb=1e-6, progress=packed) == 6
+    assert verify_shards(target, progress=checked) == []
+    packed.count()
+    checked.count()
+    assert len(packed) == 2 and len(checked) == 6
     store = store_of(target)
     index = json.loads(b"".join(store.blocks("index.json")))
     assert [entry["name"] for entry in index["shards"]] == [

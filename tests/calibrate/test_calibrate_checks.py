@@ -1,11 +1,12 @@
 """Captures that break what the noise models suppose: each is named in the report; good ones are not."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import broken_captures
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, norm
 
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration
 from hesim_render.calibrate.aps import checks as frame_checks
@@ -154,14 +155,80 @@ def test_groups_of_brightness_hold_enough_pixels_and_events():
     assert np.all(np.diff(group[order]) >= 0)
 
 
-def test_searches_that_end_elsewhere_are_told(tmp_path):
+@pytest.fixture(scope="module")
+def good_events(tmp_path_factory):
+    """Captures of good counts, and their calibration."""
+    folder = tmp_path_factory.mktemp("good") / "set"
+    broken_captures.events(folder, size=48)
+    captures = read_captures(folder)
+    return captures, event_analysis.analyse(captures, read_static(captures))
+
+
+def test_maps_for_the_report_are_the_counts_of_the_captures(good_events, monkeypatch):
+    """Mean probability of both polarities on a coarser grid, counts by brightness and by contrast, thresholds."""
+    captures, result = good_events
+    monkeypatch.setattr(event_output, "_FIGURE_PX", 20)
+    maps = event_output.maps(captures, result)
+    with np.load(captures.folder / "evs_static.npz") as data, np.load(captures.folder / "evs_steps.npz") as steps:
+        on, off, trials = data["n_on"], data["n_off"], int(data["n_trials"])
+        probability = np.mean([on / trials, off / trials], axis=0)[::3, ::3]
+        np.testing.assert_allclose(maps["figure_probability"], probability, rtol=1e-6)
+        good = ~result.bad
+        for map_on, map_off, name in ((on, off, "lit"), (data["dark_n_on"], data["dark_n_off"], "dark")):
+            counted, top = maps[f"figure_on_off_{name}"], float(maps[f"figure_on_off_{name}_top"])
+            wide = (top + 0.5) / counted.shape[0]
+            assert wide == int(wide) and counted.shape[0] == counted.shape[1]
+            # rows are OFF, columns ON
+            inside = good & (map_on < top) & (map_off < top)
+            assert counted.sum() == inside.sum() >= 0.995 * good.sum()
+            own = np.zeros_like(counted)
+            np.add.at(own, (map_off[inside] // int(wide), map_on[inside] // int(wide)), 1)
+            np.testing.assert_array_equal(counted, own)
+        rates = maps["figure_rates"]
+        dim = rates[:, 0] > 0  # the dark capture is a brightness of its own
+        assert rates[dim, 1].sum() == on[good].sum() and rates[dim, 2].sum() == off[good].sum()
+        assert rates[~dim, 1].sum() == data["dark_n_on"][good].sum()
+        assert rates[:, 3].sum() == 2 * trials * good.sum()
+        per_step = [steps["contrast"], *(steps[key][:, good].sum(axis=1) for key in ("n_on", "n_off"))]
+        np.testing.assert_allclose(maps["figure_steps"], np.stack(per_step, axis=1))
+        assert maps["figure_steps_trials"] == 200 * good.sum()
+    line, fit_on, fit_off = maps["figure_steps_fit"].T
+    thresholds = result.thresholds
+    assert np.interp(thresholds.theta_on, line, fit_on) == pytest.approx(0.5, abs=0.02)
+    assert np.interp(-thresholds.theta_off, line, fit_off) == pytest.approx(0.5, abs=0.02)
+    signal, p_on, p_off = maps["figure_rates_fit"].T
+    for k, p in ((1, p_on), (2, p_off)):
+        wanted = rates[:, k] / rates[:, 3]
+        error = np.sqrt(wanted / rates[:, 3]) + 0.04 * wanted
+        assert np.all(np.abs(np.interp(rates[:, 0], signal, p) - wanted) < 6 * error)
+
+
+@pytest.mark.parametrize(("on", "off", "named"), [
+    (0.0031, 0.0002, []),  # the leak, and nothing
+    (0.0131, 0.0002, ["ON"]), (0.0031, 0.0102, ["OFF"]), (0.0131, 0.0102, ["ON", "OFF"]), (0.0030, -0.05, []),
+])  # fmt: skip
+def test_a_floor_is_what_steps_of_the_other_direction_give_beyond_leak(on, off, named):
+    """Of ON events the leak of 0.003 ± 0.0004 is taken off, of OFF events nothing; errors of 0.001 each."""
+    fit = SimpleNamespace(
+        free=np.ones(6, bool), values=np.array([1, 1, 1, 1, 0, 0.003]), covariance=np.diag([0, 0, 0, 0, 0, 0.0004**2])
+    )
+    levels = event_checks.CurveLevels((on, 0.001), (off, 0.001), (1.0, 0.001))
+    found = event_checks._floor(SimpleNamespace(together=fit), levels)
+    if not named:
+        assert found is None
+        return
+    values = {"ON": on, "OFF": off}
+    assert " and ".join(f"{values[name]:.2g} ({name})" for name in named) in found.text
+    away = {"ON": abs(on - 0.003) / np.hypot(0.001, 0.0004), "OFF": abs(off) / 0.001}
+    assert found.p_value == pytest.approx(min(4 * norm.sf(away[name]) for name in named), rel=1e-6)
+
+
+def test_searches_that_end_elsewhere_are_told(good_events):
     """Starts of which three end 20 standard errors away, put into a calibration of good counts.
 
     Where their counts are far less likely these searches were lost: they say nothing about the counts.
     """
-    broken_captures.events(tmp_path / "set", size=48)
-    captures = read_captures(tmp_path / "set")
-    result = event_analysis.analyse(captures, read_static(captures))
+    captures, result = good_events
     assert event_checks.check_events(result, "voltage")[0] == []
     values = result.ends.values.copy()
     values[:3, 1] += 20 * result.ends.standard_error[1]

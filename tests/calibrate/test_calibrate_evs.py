@@ -180,7 +180,8 @@ def test_large_mismatch_is_recovered_from_steps_and_from_the_static_counts_alone
     capture_sets.write_events(tmp_path / "set", size=(120, 136), trials=20000, mismatch=mismatch)
     injected = np.load(both / "truth_maps.npz")["evs_bad"]
     injected |= 1 + mismatch * np.random.default_rng(8).standard_normal(injected.shape) < 0.05
-    for folder, source, bad in ((both, "steps", injected), (tmp_path / "set", "static counts", 0 * injected)):
+    none = np.zeros((120, 136), np.bool_)
+    for folder, source, bad in ((both, "steps", injected), (tmp_path / "set", "static counts", none)):
         calibrate_evs(folder, tmp_path / f"{source}.yaml")
         section = read_calibration(tmp_path / f"{source}.yaml")["evs"]
         found = section["threshold_mismatch_rel"]

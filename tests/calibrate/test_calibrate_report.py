@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps, write_report
+from hesim_render.calibrate.report import events as event_report
 from hesim_render.calibrate.report.parts import headline
 from hesim_render.calibrate.result import plain
 from hesim_render.core import drawing
+from hesim_render.core.drawing import COLOURS
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.core.html import number
 
@@ -317,3 +319,38 @@ def test_a_report_begins_with_the_figures_their_intervals_and_saturation(both):
     ]
     section["full_well_e"] = {"value": None, "reason": "no level is bright enough"}
     assert headline(section)[1] == "Not known is the saturation capacity: no level is bright enough."
+
+
+def points_of(axes):
+    """Colour and data of what has markers and what has a line, by colour."""
+    marks, curves = {}, {}
+    for line in axes.lines:
+        kind = curves if line.get_linestyle() not in ("None", "none", "") else marks
+        kind.setdefault(line.get_color(), []).append(line.get_xydata())
+    return marks, curves
+
+
+def test_counts_are_drawn_over_the_fit_of_their_own_polarity(monkeypatch):
+    """S-curves and rates: ON in the second colour, OFF in the first; a triangle at 3/n where nothing was counted."""
+    drawn = []
+    monkeypatch.setattr(event_report, "svg", lambda figure: drawn.append(figure) or "")
+    step, trials = np.array([-0.3, 0.1, 0.4]), 730
+    on, off = np.array([11, 300, 721]), np.array([703, 250, 17])
+    line = np.linspace(-0.3, 0.4, 5)
+    fits = np.array([0.01, 0.2, 0.5, 0.7, 0.99]), np.array([0.97, 0.6, 0.4, 0.3, 0.02])
+    steps = {"figure_steps": np.stack([step, on, off], axis=1), "figure_steps_trials": np.array(trials)}
+    event_report._steps(steps | {"figure_steps_fit": np.stack([line, *fits], axis=1)})
+    signal, many = np.array([3.0, 9.0, 20.0]), np.array([5_000, 7_000, 2_000])
+    rates = {"figure_rates": np.stack([signal, on, [30, 0, 4], many], axis=1)}
+    at = np.array([3.0, 7.0, 11.0, 20.0, 25.0])
+    event_report._rates(rates | {"figure_rates_fit": np.stack([at, *fits], axis=1)})
+    s_curve, rate = (points_of(figure.axes[0]) for figure in drawn)
+    for colour, counts, fit in ((COLOURS[1], on, fits[0]), (COLOURS[0], off, fits[1])):
+        np.testing.assert_allclose(s_curve[0][colour][0], np.stack([step, counts / trials], axis=1))
+        np.testing.assert_allclose(s_curve[1][colour][0], np.stack([line, fit], axis=1))
+        np.testing.assert_allclose(rate[1][colour][0], np.stack([at, fit], axis=1))
+    np.testing.assert_allclose(rate[0][COLOURS[1]][0], np.stack([signal, on / many], axis=1))
+    np.testing.assert_allclose(rate[0][COLOURS[0]][0], [[3, 30 / 5_000], [20, 4 / 2_000]])
+    np.testing.assert_allclose(rate[0][COLOURS[0]][1], [[9, 3 / 7_000]])
+    low, high = drawn[1].axes[0].get_ylim()
+    assert low == pytest.approx(0.8 * 3 / 7_000) and high > 0.99  # the fit and all counts are seen

@@ -109,19 +109,23 @@ def test_known_thresholds_are_drawn_towards_the_mean_by_their_noise():
 
 @pytest.mark.parametrize(("law", "power"), [("sqrt", 0.5), ("linear", 1.0)])
 def test_probability_of_events_and_its_slopes(law, power):
-    """P = Q((1 ∓ ρ) r u/√(1 + m² u²)) (+ λ of ON), u = Θ (A I + B)/√(2 ((1 + e y)² + w y²)), y = √I or I."""
+    """P is the mean of Q(θ±/σ) over pixels whose θ± = (1 ∓ ρ) (r + m z) θ, as pixels have them, with a normal z; λ
+    comes to ON. u = Θ (A I + B)/√(2 ((1 + e y)² + w y²)), y = √I or I.
+    """
     signal = np.array([3.0, 3.0, 40.0, 40.0, 900.0, 900.0])
     polarity = np.array([1.0, -1, 1, -1, 1, -1])
     relative, spread = np.array([1.0, 0.9, 1.1, 1.05, 0.97, 1.2]), np.array([0.1, 0.12, 0.05, 0.2, 0.15, 0.08])
     cells = Cells(signal, polarity, relative, spread, np.ones(6), np.zeros(6), 1)
     at = np.array([0.004, np.log(0.9), 0.0021 if law == "sqrt" else 2e-5, 0.013 if law == "sqrt" else 9e-4, 0.06, 3e-3])
-    theta_v = 2.3
+    theta_v, z = 2.3, np.linspace(-9, 9, 2_001)
+    weight = norm.pdf(z) / norm.pdf(z).sum()
 
     def expected(parameters):
         a, log_b, w, e, rho, leak = parameters
         y = signal**power
         u = theta_v * (a * signal + np.exp(log_b)) / np.sqrt(2 * ((1 + e * y) ** 2 + w * y**2))
-        p = norm.sf((1 - polarity * rho) * relative * u / np.sqrt(1 + (spread * u) ** 2))
+        theta = (1 - polarity * rho) * (relative + spread * z[:, None])
+        p = weight @ norm.sf(theta * u)
         return np.log(p + np.where(polarity > 0, leak, 0.0))
 
     found, slopes = log_probability(at, cells, theta_v, law)
@@ -211,6 +215,16 @@ def test_pooled_s_curves_have_the_moments_of_their_law():
     steps = SimpleNamespace(**{**vars(steps), "events": lambda polarity: both[polarity]})
     for s in (1, -1):
         np.testing.assert_allclose(trials_fit.pixel_thresholds(steps, s), centre[s], atol=2e-3)
+    # of several lights the brightest of that polarity, whatever those of the other are
+    lights = {1: 70.0, -1: 41.0}
+    more = [size[:3] * s for s in (1, -1)]
+    unlike = SimpleNamespace(
+        signal_dn=np.concatenate([[lights[s] for s in sign], [31.0] * 3, [17.0] * 3]),
+        contrast=np.concatenate([contrast, *more]), calm=np.concatenate([calm, calm[:6]]),
+        events=lambda polarity: np.concatenate([both[polarity], np.zeros((6, 2, 3))]),
+    )  # fmt: skip
+    for s in (1, -1):
+        np.testing.assert_allclose(trials_fit.pixel_thresholds(unlike, s), centre[s], atol=2e-3)
 
 
 def test_middle_spread_and_leak_of_a_start():

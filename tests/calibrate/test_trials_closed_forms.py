@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm, poisson
 
+from hesim_render.calibrate.asynchronous import analysis, defects
 from hesim_render.calibrate.asynchronous import checks as trial_checks
-from hesim_render.calibrate.asynchronous import defects
 from hesim_render.calibrate.asynchronous.likelihood import LEAK, NAMES, RESPONSE
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
 from hesim_render.calibrate.evs import fitted, medians
@@ -281,3 +281,24 @@ def test_events_away_from_the_threshold_are_told_beyond_leak():
     assert "0.014 (ON) and 0.001 (OFF)" in told.text
     off[0, 0] = 0
     assert found().p_value == pytest.approx(2 * poisson.sf(699, usual + 0.5))
+
+
+@pytest.mark.parametrize(("on", "off"), [(0.071, 0.052), (0.006, 0.004)])
+def test_the_mismatch_of_both_polarities_is_weighed_by_their_covariance(on, off):
+    """Generalised least squares: Vᵢⱼ⁻¹ sums to the weights; 0 with a limit of two errors more where it is not seen."""
+    covariance = np.array([[0.0030**2, 0.4 * 0.0030 * 0.0045], [0.4 * 0.0030 * 0.0045, 0.0045**2]])
+    inverse = np.linalg.inv(covariance)
+    error = 1 / np.sqrt(inverse.sum())
+    value = inverse.sum(axis=0) @ [on, off] * error**2
+    k = [analysis.NAMES.index(name) for name in ("mismatch_on", "mismatch_off")]
+    values, whole = np.full(len(analysis.NAMES), 7.0), np.eye(len(analysis.NAMES))
+    values[k], whole[np.ix_(k, k)] = (on, off), covariance
+    found = analysis._mismatch(SimpleNamespace(values=values, covariance=whole))
+    assert found.limit == pytest.approx(value + 2 * error)
+    if on > 0.05:
+        assert (found.value, found.error) == pytest.approx((value, error))
+    else:
+        assert found.value == 0 and np.isnan(found.error)
+    whole[np.ix_(k, k)] = np.nan
+    found = analysis._mismatch(SimpleNamespace(values=values, covariance=whole))
+    assert (found.value, found.limit) == (0, max(on, off)) and np.isnan(found.error)

@@ -658,3 +658,67 @@ def test_intervals_cover_the_truth_of_sensors_of_a_kind(tmp_path):
     covered = np.mean(np.abs(scores) < 1.96, axis=0)
     assert np.all((square > 0.55) & (square < 1.6)), square
     assert np.all((covered >= 0.90) & (covered <= 0.99)), covered
+
+
+def test_trials_are_counted_by_kind_bin_and_part(tmp_path):
+    """Against loops over what each trial of each pixel did, drawn at random; parts are those of the last kind."""
+    rng, shape, trials, parts = np.random.default_rng(2), (2, 3), np.array([5, 7, 12]), 4
+    plan = lab_trials.TrialPlan(
+        np.array([4.0, 9.0, 30.0]), np.array([0.2, -0.3, 0.0]), 800, np.array([0, 30, 90]), trials, parts
+    )
+    done, advanced, lights = [], [], []
+    bench = lab_trials.TrialBench.__new__(lab_trials.TrialBench)
+    bench.noise, bench.advance = SimpleNamespace(layout=SimpleNamespace(evs_shape=shape)), advanced.append
+    bench._electrons = lambda signal_dn: signal_dn
+
+    def trial(before, after, given):
+        lights.append((before, after))
+        done.append((rng.random(6) < 0.7, rng.integers(-1, 2, 6), rng.choice([-1, 1], 6)))
+        return done[-1]
+
+    bench._trial = trial
+    bench.write(tmp_path / "t.npz", plan)
+    calm, on, off, disturbed = (np.zeros((*size, 6), int) for size in ((3,), (3, 2), (3, 2), (4,)))
+    kinds = np.repeat([0, 1, 2], trials)
+    for number, (kind, (quiet, first, sign)) in enumerate(zip(kinds, done, strict=True)):
+        for pixel in range(6):
+            calm[kind, pixel] += quiet[pixel]
+            if first[pixel] >= 0:
+                (on if sign[pixel] > 0 else off)[kind, first[pixel], pixel] += 1
+            if kind == 2 and (first[pixel] >= 0 or not quiet[pixel]):
+                disturbed[(number - 12) // 3, pixel] += 1
+    with np.load(tmp_path / "t.npz") as found:
+        for name, wanted in (("n_calm", calm), ("n_on", on), ("n_off", off), ("bright_parts", disturbed)):
+            np.testing.assert_array_equal(found[name], wanted.reshape(*wanted.shape[:-1], *shape))
+        assert found["part_trials"] == 3 and found["part_us"] == 3 * (890 + 1)
+    assert advanced == pytest.approx([890e-6] * 24)
+    steps = [(4.0, 4 * np.exp(0.2)), (9.0, 9 * np.exp(-0.3)), (30.0, None)]
+    assert [before for before, _ in lights] == [steps[kind][0] for kind in kinds]
+    assert all(
+        after == steps[kind][1] or after == pytest.approx(steps[kind][1])
+        for kind, (_, after) in zip(kinds, lights, strict=True)
+    )
+
+
+def test_steps_of_a_plan_reach_parts_of_both_thresholds():
+    """x = β1 I + β2: from each light, ln x₁/x₀ goes in equal steps from a quarter to 1.9 thresholds, up and down; where
+    the light would end below a thousandth of itself the step is left out."""
+    first = SimpleNamespace(beta1=0.04, beta2=0.9)
+    spec = SimpleNamespace(
+        photoreceptor_cutoff_hz=170.0, coefficients=[first], contrast_threshold_on=0.21, contrast_threshold_off=0.34
+    )
+    plans = lab_trials.plan_trials(SimpleNamespace(spec=spec), 6)
+    steps = plans["evs_s_curve"]
+    assert np.all(steps.trials == 6) and steps.signal_dn.size == steps.contrast.size == steps.trials.size
+    before = 0.04 * steps.signal_dn + 0.9
+    change = np.log((0.04 * steps.signal_dn * np.exp(steps.contrast) + 0.9) / before)
+    for light in np.unique(steps.signal_dn):
+        for sign, theta in ((1, 0.21), (-1, 0.34)):
+            own = change[(steps.signal_dn == light) & (np.sign(steps.contrast) == sign)] * sign / theta
+            assert own[0] == pytest.approx(0.25) and np.ptp(np.diff(own)) < 1e-9 and own[-1] <= 1.9 + 1e-9
+            next_one = (0.04 * light + 0.9) * np.exp(sign * theta * (own[-1] + np.diff(own)[0]))
+            assert own[-1] == pytest.approx(1.9) or (next_one - 0.9) / 0.04 < 1e-3 * light
+    period_us = 1e6 / 170
+    assert steps.settle_us == np.ceil(0.75 * period_us)
+    assert steps.edges_us.tolist() == [0, np.ceil(0.03 * period_us), np.ceil(1.25 * period_us)]
+    assert plans["evs_noise_rate"].edges_us.tolist() == [0, np.ceil(20 * period_us)]

@@ -13,6 +13,8 @@ import hesim_render as hr
 from hesim_render.capture import kept_run
 from hesim_render.core.errors import OutputError
 from hesim_render.exchange import dsec_writer
+from hesim_render.pixels.evs.events import EVENT_DTYPE
+from hesim_render.recording.frame import Frame
 from hesim_render.sources.video.linear import Lineariser
 
 #: sensor, its changes, input, options: comparisons at ticks with frames in exposure, without events, without frames,
@@ -158,3 +160,74 @@ def test_a_short_run_keeps_nothing(clip, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         record("ticks", clip, tmp_path / "out", monkeypatch, stop_after=12, long_s=20.0)
     assert others(tmp_path) == []
+
+
+def test_what_is_kept_comes_back_in_its_parts_and_the_run_goes_on_after_the_last(monkeypatch):
+    """Three parts of blocks and frames; of a fourth that was not ended nothing comes back, nor of one with a gap."""
+    rng, clock, kept = np.random.default_rng(3), [0.0], {}
+    monkeypatch.setattr(kept_run.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(kept_run, "_MOST_EVENTS", 50)
+    journal = SimpleNamespace(read=kept.get)
+    journal.keep = lambda key, arrays: kept.__setitem__(key, b"".join(array.tobytes() for array in arrays))
+
+    def events(count):
+        made = np.zeros(count, EVENT_DTYPE)
+        made["t_us"], made["x"] = np.sort(rng.integers(0, 9_000, count)), rng.integers(0, 7, count)
+        return made
+
+    mask = np.arange(12).reshape(3, 4) % 3 > 0
+
+    def frame(index):
+        noise_free = np.where(mask, rng.random((3, 4)), np.nan).astype(np.float32)
+        error = np.where(mask, np.float32(0), np.float32(np.nan))
+        return Frame(rng.integers(0, 99, (3, 4)).astype(np.uint16), mask, noise_free, error, 70, 40, 30, 1.5, index)
+
+    class Capture:
+        frame_mask, progress, given = mask, (0, 900), None
+
+        def state(self):
+            return {"at": self.progress[0]}
+
+        def go_on(self, state):
+            self.given = state
+
+    def run(capture):
+        return kept_run.KeptRun(capture, journal, 10.0)
+
+    # blocks of 20 to 70 events, a frame after every second one, a part every third
+    items, capture = [], Capture()
+    first = run(capture)
+    for number in range(12):
+        items.append(events(20 + 7 * number))
+        if number % 2:
+            items.append(frame(number // 2))
+    ends = []
+    for number, item in enumerate(items):
+        capture.progress = (50 * (number + 1), 900)
+        clock[0] += 2.3
+        before = len(kept)
+        first.keep(item)
+        if clock[0] - (ends[-1][1] if ends else 0.0) >= 10:
+            assert len(kept) > before
+            ends.append((number + 1, clock[0]))
+    assert len(ends) == 3 and ends[-1][0] < len(items)
+
+    def back():
+        got, told, again = [], [], Capture()
+        writer = SimpleNamespace(add_events=got.append, add_frame=got.append)
+        run(again).go_on(writer, lambda *given: told.append(given))
+        return got, told, again.given
+
+    got, told, state = back()
+    there = items[: ends[-1][0]]
+    assert told == [(50 * count, 900, "simulated µs") for count, _ in ends] and state == {"at": 50 * ends[-1][0]}
+    for kind in (np.ndarray, Frame):
+        mine, wanted = ([one for one in each if isinstance(one, kind)] for each in (got, there))
+        assert len(mine) == len(wanted) > 0
+        for one, other in zip(mine, wanted, strict=True):
+            for name in ("raw", "electrons_mean", "electrons_stderr") if kind is Frame else (None,):
+                pair = (one, other) if name is None else (getattr(one, name), getattr(other, name))
+                np.testing.assert_array_equal(*pair)
+            assert kind is not Frame or one.times == other.times
+    # one chunk of the second part is gone: that part and the last do not come back
+    assert kept.pop(kept_run.key_of("frame", 2)) and len(back()[1]) < 3

@@ -170,6 +170,23 @@ def test_a_dry_run_of_a_video(capsys, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["v.npy"]
 
 
+def test_a_cube_is_rendered_with_keys_of_scene_and_sensor(capsys, tmp_path, monkeypatch):
+    """--set changes the scene, or the sensor after sensor.; window, rays and seed reach the renderer."""
+    seen = []
+
+    def render(scene, sensor, bands, samples, begin_us, *, end_us, seed):
+        seen.append((scene.spec.light.illuminance_lux, sensor.spec.lens.f_number, samples, begin_us, end_us, seed))
+        return np.array(bands), np.full((5, 7, 2), 0.5, np.float32), np.full((5, 7, 2), 0.015, np.float32)
+
+    monkeypatch.setattr("hesim_render.render_cube", render)
+    words = ["cube", "colorchecker", "--sensor", "reference-mono", "--bands", "450,620", "--out", tmp_path / "c.exr"]
+    words += ["--set", "light.illuminance_lux=321", "--set", "sensor.lens.f_number=3.7", "--roi", "7x5"]
+    told = call(capsys, *words, "--begin-us", "300", "--end-us", "700", "--samples", "12")
+    assert seen == [(321, 3.7, 12, 300, 700, 7)]
+    text = told[1] + told[2]
+    assert text.startswith("2 bands of 7x5 px, mean 0.5 W") and "standard error of a pixel 3 % of it" in text
+
+
 def test_a_dry_run_of_a_cube(capsys, tmp_path):
     np.save(tmp_path / "c.npy", np.full((12, 16, 31), 0.3, np.float32))
     words = ["simulate", tmp_path / "c.npy", "--set", "wavelength_nm=400:700:10", "--set", "beyond=hold"]

@@ -54,6 +54,10 @@ def test_compare_prints_a_line_a_distance(capsys, recordings):
     lines = {line.split("  ")[0]: line for line in text.splitlines()}
     assert lines["rate"].endswith("differs") and not lines["hot pixels"].endswith("differs")
     status, text, _ = call(capsys, "compare", *recordings, "--size", "21x15", "--json")
+    for one in json.loads(text)["distances"]:
+        low, high = (f"{end:.4g}" for end in one["interval_95"])
+        assert f"{one['value']:.4g}" in lines[one["name"]] and f" {low} to {high} " in lines[one["name"]]
+        assert one["interval_95"][0] <= one["interval_95"][1]
     rate = json.loads(text)["distances"][0]
     assert rate["name"] == "rate" and rate["value"] == pytest.approx(np.log(31 / 24), abs=0.06)
 

@@ -314,6 +314,11 @@ def test_texts_on_the_axes_of_the_picture_do_not_overlap(name, tmp_path, monkeyp
     monkeypatch.setattr(picture, "new_figure", lambda size: drawn.append(drawing.new_figure(size)) or drawn[-1])
     picture.write_picture(hr.load_sensor(name), tmp_path / "p.png")
     (figure,) = drawn
+    # three drawings a row at most, those that are not there left out
+    axes = [each for each in figure.axes if each.axison]
+    columns = min(len(axes), 3)
+    assert {each.get_subplotspec().get_gridspec().ncols for each in axes} == {columns}
+    assert {each.get_subplotspec().get_gridspec().nrows for each in axes} == {-(-len(axes) // columns)}
     with drawing.report_style():
         figure.canvas.draw()
         for axes in figure.axes:

@@ -93,6 +93,7 @@ def test_time_that_goes_back_is_no_new_start(header, dtype, words, tmp_path):
     (b"% evt 4\n", "has the format '4'"),
     (b"% format EVT3;height=9999;width=10\n", "has the size 10x9999"),
     (b"% geometry 0x20\n% evt 3.0\n% end\n", "has the size 0x20"),
+    (b"% format EVT3;width=640\n% end\n", "has the size 640x"),
     (b"% evt 3.0\n% end\n", "does not state the size"),
     (b"#!AER-DAT4.0\r\n", "cut short"),
     (b"#!AER-DAT3.1\r\n", "not an AEDAT4 file"),

@@ -42,6 +42,14 @@ def test_the_size_in_an_hdf5_file_may_be_text_or_bytes(tmp_path, geometry):
     assert prophesee_hdf5.read_shape(tmp_path / "e.hdf5") == (480, 640)
 
 
+def test_exposures_are_pulses_of_line_0():
+    """Rising at its begin, falling at its end, as `import --trigger-channel 0` reads them (docs/formats.md)."""
+    found = exposure_triggers([100, 5_000], [1_300, 6_200])
+    assert found["t_us"].tolist() == [100, 1_300, 5_000, 6_200] and found["edge"].tolist() == [1, -1, 1, -1]
+    begin, end = exposures_of_pulses(found, 0, 2, "e.raw")
+    assert (begin.tolist(), end.tolist()) == ([100, 5_000], [1_300, 6_200])
+
+
 def stream_of(events, triggers, shape=SHAPE):
     return EventStream(lambda: EventStream.of(events, shape), shape, triggers=lambda: triggers)
 

@@ -255,3 +255,27 @@ def test_the_capture_knows_the_types_of_what_it_handles():
 @pytest.mark.parametrize("name", EVERY)
 def test_a_module_has_a_size_that_one_reads(name):
     assert len(MODULES[name].read_text(encoding="utf-8").splitlines()) <= 350
+
+
+#: What replaces files, reads or runs what a file names, leaves noise out, or changes the output of a command.
+ASKED_FOR = {
+    "overwrite", "allow_outside", "run_programs", "clean", "exact", "live", "yes", "dry_run", "quiet", "json_",
+    "help_all",
+}  # fmt: skip
+
+
+def test_nothing_is_replaced_run_or_left_out_until_it_is_asked_for():
+    """Every function of the package that has such a parameter with a default has False."""
+    found = dict.fromkeys(ASKED_FOR, 0)
+    for name, path in MODULES.items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            plain = [*node.args.posonlyargs, *node.args.args]
+            pairs = [*zip(reversed(plain), reversed(node.args.defaults), strict=False)]
+            pairs += zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True)
+            for argument, default in pairs:
+                if argument.arg in ASKED_FOR and default is not None:
+                    found[argument.arg] += 1
+                    assert isinstance(default, ast.Constant) and default.value is False, f"{name}.{node.name}"
+    assert min(found.values()) >= 2 and found["overwrite"] > 40

@@ -127,3 +127,19 @@ def test_a_largest_value_of_other_bits_is_refused(tmp_path, largest, message):
     (tmp_path / "a.pgm").write_bytes(pgm(b"P5", bytes(70), largest))
     with pytest.raises(SpecError, match=message):
         read_grey(tmp_path / "a.pgm", SHAPE)
+
+
+def test_the_list_of_a_folder_is_a_text_file_with_a_line_of_sizes(tmp_path):
+    """Not a folder that is called like one, no file of another kind, and no text without such a line."""
+    (tmp_path / "old.txt").mkdir()
+    (tmp_path / "notes.txt").write_text("n pictures were taken\n")
+    (tmp_path / "copy.md").write_text("n 12 7 5\n")
+    assert find_list(tmp_path) is None
+    (tmp_path / "pairs.CSV").write_text("# camera\nN;12;7;5\n")
+    assert find_list(tmp_path) == find_list(tmp_path / "pairs.CSV") == tmp_path / "pairs.CSV"
+    assert find_list(tmp_path / "copy.md") is None and find_list(tmp_path / "none") is None
+    (tmp_path / "more.lst").write_text("n 12 7 5\n")
+    with pytest.raises(SpecError, match=r"holds 2 lists of EMVA 1288 pictures, more\.lst and pairs\.CSV"):
+        find_list(tmp_path)
+    (tmp_path / "EMVA1288_Data.txt").write_text("n 12 7 5\n")
+    assert find_list(tmp_path) == tmp_path / "EMVA1288_Data.txt"

@@ -2,6 +2,7 @@
 
 import pytest
 
+from hesim_render.recording import quality
 from hesim_render.recording.quality import is_short_of_wish, render_lines, verdict_lines
 
 SHARES = {
@@ -29,6 +30,26 @@ def test_bounds_are_told_where_enough_was_seen():
         "confidence at most 1.3 %; missed 0.4 % of signal events, at most 1.8 %; too many 0.2 %, at most 0.9 %",
     ]
     assert render_lines(None) == []
+
+
+def test_a_few_of_the_runs_that_miss_their_quality_are_named(monkeypatch):
+    """As many as fit into a line, and whether there are more; the remedy is that of the worst one."""
+    monkeypatch.setattr(quality, "_MOST_NAMED", 3)
+    names = ["n", "b", "z", "c"]
+    for count, named in ((2, "n, b"), (3, "n, b, z"), (4, "n, b, z, …")):
+        audits = {
+            name: {"verdict": "not met", "quality_needed": 0.4 - 0.07 * k, "samples_needed": 300 + 11 * k}
+            for k, name in enumerate(names[:count])
+        }
+        audits |= {"good": {"verdict": "met"}, "unseen": {"verdict": "not shown"}, "none": None}
+        first, second = verdict_lines(audits, "clips")
+        least, most = 0.4 - 0.07 * (count - 1), 300 + 11 * (count - 1)
+        assert first == (
+            f"NOT MET: {count} of {count + 3} clips are worse than asked for ({named}); quality {least:g} would do; "
+            f"{most} samples would do"
+        )
+        assert second.startswith(f"audit: too little was seen in 1 of {count + 3} clips")
+    assert verdict_lines({"good": {"verdict": "met"}}, "clips") == []
 
 
 @pytest.mark.parametrize(("shares", "told"), [

@@ -1,13 +1,17 @@
 """Errors and derived figures of test reports, from numbers given by hand."""
 
+import io
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy import special
 from scipy.stats import norm
 
-from hesim_render.report import emva, latency, limits, modulated, s_curves
+from hesim_render.core.errors import SpecError
+from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, s_curves
+from hesim_render.report.bench import EventBench
 from hesim_render.report.estimates import crossing, log_estimated, mean_error, quantile, whole_us_quantile
 from hesim_render.report.latency import Answers
 from hesim_render.report.steady import Background, _rate, doubling
@@ -31,6 +35,10 @@ def test_the_error_of_a_mean_has_parts_of_pixels_and_of_jumps():
     alone[0] = 1, -1
     assert mean_error(alone, np.ones((2, 2), bool)) == pytest.approx(np.sqrt(2) / 4)
     assert np.isnan(mean_error(alone, np.eye(2, dtype=bool) & False))
+    # two values are enough: those of two pixels and one jump, 3 apart, are 1.5/√2 off; one is not
+    few = np.array([[2.0, 5.0], [7.0, 7.0]])
+    assert mean_error(few, np.array([[True, True], [False, False]])) == pytest.approx(1.5 / np.sqrt(2))
+    assert np.isnan(mean_error(few, np.array([[True, False], [False, False]])))
 
 
 def test_a_quantile_has_the_interval_of_the_share_below_it():
@@ -220,3 +228,160 @@ def test_the_widths_of_an_s_curve_and_their_errors_are_those_of_the_logarithms(m
         assert told["value"] == pytest.approx(100 * sign * (np.exp(sign * 0.21) - 1))
         assert told["standard_error"] == pytest.approx(100 * np.exp(sign * 0.21) * np.sqrt(covariance[0, 0]))
         assert entries["threshold"]["standard_error"] == pytest.approx(np.sqrt(covariance[0, 0]))
+
+
+def test_ends_of_the_range_are_as_sure_as_the_fewest_answers(monkeypatch):
+    """Steps times pixels of the light that has the fewest of them decides how near to 1 a share can be known."""
+    counts = []
+    monkeypatch.setattr(limits, "crossing", lambda *given: counts.append(given[-1]) or (0.3, 0.01))
+    sizes = [(40, 30), (7, 50), (90, 4), (25, 60)]  # 1200, 350, 360, 1500
+    answers = [Answers(2.0**k, 0.5, None, c, 0.95, 0.01, p, {}, {}, 40) for k, (c, p) in enumerate(sizes)]
+    limits.dynamic_range(answers, [0.0] * 4)
+    each = {one.count * one.pixels for one in answers}
+    assert counts == [min(each)] * 2 and len(each) == 4
+
+
+def test_a_steady_recording_belongs_to_the_nearest_light_within_a_third():
+    def lights(*lux):
+        spec = SimpleNamespace(steady=[SimpleNamespace(lux=one) for one in lux])
+        return SimpleNamespace(spec=spec)
+
+    assert figures._steady(lights(0.0, 71.0, 55.0, 100.0), 60.0).lux == 55.0
+    assert figures._steady(lights(60 * 1.29, 0.0), 60.0).lux == 60 * 1.29
+    assert figures._steady(lights(60 / 1.29), 60.0).lux == 60 / 1.29
+    assert figures._steady(lights(60 * 1.34, 60 / 1.34), 60.0) is None
+
+
+def test_intervals_are_drawn_as_a_density():
+    """The area of each bar is the number of its intervals, each of a whole number of µs."""
+    counts = np.random.default_rng(5).poisson(40 / (1 + np.arange(3000) / 60))
+    dead = SimpleNamespace(key="dead_time", value={"value": 130.0})
+    axes = Figure().subplots()
+    drawings._intervals(axes, SimpleNamespace(intervals=counts, entries=[dead]))
+    (bars,) = axes.patches
+    density, edges = bars.get_data()[:2]
+    for value, first, last in zip(density, edges[:-1], edges[1:], strict=True):
+        number = counts[int(first) : int(last)].sum()
+        assert value * (last - first) == pytest.approx(number) if number else np.isnan(value)
+    assert edges[0] == 1 and edges[-1] < 3000 and axes.lines[0].get_xdata()[0] == 130.0
+
+
+def test_pages_of_the_pdf_hold_their_lines(monkeypatch):
+    """No line over the margins of 42 pt or over another one; a table that goes on has its head on each page."""
+    lines = []
+    made = pdf.Document(io.BytesIO(), "t")
+
+    def note(text, x, y, size, bold=False):
+        made._page()
+        lines.append((made.count, x, y, size, text))
+
+    monkeypatch.setattr(made, "_line", note)
+    made.text("A title", 15.0, True)
+    made.text("some words of a paragraph " * 40)
+    for k in range(330):
+        made.text(f"line {k}", (8.0, 10.5, 6.3, 15.0, 8.0, 9.1, 12.4)[k % 7])
+    cells = [(f"cell {k}", "a long text of a cell that takes several lines " * (1 + k % 3)) for k in range(44)]
+    made.table(SimpleNamespace(title="A table", head=("name", "what"), rows=cells, widths=(1.0, 3.0)))
+    places = []
+    made.drawings([lambda axes: places.append((made.count, axes.get_position().bounds))] * 5)
+    made.close()
+    assert made.count >= 7
+    for page in range(1, made.count + 1):
+        own = [line for line in lines if line[0] == page]
+        assert all(y <= 842 - 42 and y - 1.32 * size >= 42 - 1e-6 for _, _, y, size, _ in own)
+        columns = {}
+        for _, x, y, size, _ in own:
+            columns.setdefault(x, []).append((y, size))
+        for column in columns.values():
+            assert all(
+                y - 1.32 * size >= below - 1e-6 for (y, size), (below, _) in zip(column, column[1:], strict=False)
+            )
+        of_table = [text for _, _, _, _, text in own if text.startswith("cell")]
+        assert bool(of_table) == ("name" in [text for *_, text in own])
+    assert {x for _, x, *_ in lines} == {42.0, 42 + 511 / 4}
+    assert [text for *_, text in lines if text.startswith("cell")] == [name for name, _ in cells]
+    # three in a row of 511 pt, inside of it; the other two below
+    lefts, bottoms = ([bounds[k] for _, bounds in places] for k in (0, 1))
+    assert np.diff(lefts[:3]) * 595 == pytest.approx([511 / 3] * 2) and lefts[3:] == lefts[:2]
+    assert all(
+        left * 595 > 42 and (left + bounds[2]) * 595 < 553 for left, (_, bounds) in zip(lefts, places, strict=True)
+    )
+    assert all(bottom * 842 > 42 for bottom in bottoms)
+    assert bottoms[:3] == [bottoms[0]] * 3 and bottoms[3:] == [bottoms[3]] * 2
+    if places[0][0] == places[3][0]:
+        assert (bottoms[0] - bottoms[3]) * 842 == pytest.approx(158)
+
+
+@pytest.mark.parametrize(("end_us", "count"), [(2_300, 2), (3_299, 2), (3_300, 3), (4_299, 3), (2_299, None)])
+def test_jumps_are_those_that_a_whole_half_period_follows(end_us, count):
+    """A rise at 300 µs, a fall 1000 µs later, and so on."""
+    steps = SimpleNamespace(file="s", trigger=None, begin_us=300, period_us=2_000)
+    given = SimpleNamespace(path=lambda name: name), steps, SimpleNamespace(span_us=lambda: (0, end_us))
+    if count is None:
+        with pytest.raises(SpecError, match="before a rise and a fall"):
+            EventBench._jumps(*given)
+        return
+    times, rises = EventBench._jumps(*given)
+    assert times.tolist() == [300, 1_300, 2_300][:count] and rises.tolist() == [True, False, True][:count]
+
+
+@pytest.mark.parametrize("celsius", [(None, None), (31.0, 31.0), (20.0, 41.5)])
+def test_background_is_drawn_by_polarity_and_temperature(celsius):
+    """One line of each, with the intervals of its values; the temperature is named where there are several."""
+
+    def rate(value):
+        return {"value": value, "interval_95": [0.7 * value, 1.6 * value]}
+
+    given = [
+        Background(lux, c, 3.0, (rate(lux + k), rate(2 * lux + k)), 40, None)
+        for k, c in enumerate(celsius) for lux in (5.0, 60.0)
+    ]  # fmt: skip
+    axes = Figure().subplots()
+    drawings._background(axes, SimpleNamespace(backgrounds=given))
+    names = [f", {c:g} °C" for c in celsius] if len(set(celsius)) > 1 else [""]
+    found = {bars.get_label(): bars for bars in axes.containers}
+    assert list(found) == [name + about for about in names for name in ("ON", "OFF")]
+    for label, bars in found.items():
+        k = [about for about in names].index(label.replace("OFF", "").replace("ON", ""))
+        own = [one for one in given if len(names) == 1 or one.temperature_c == celsius[k]]
+        wanted = [one.rates[label.startswith("OFF")]["value"] for one in own]
+        line, _, (segments,) = bars
+        np.testing.assert_allclose(line.get_xydata(), np.stack([[one.lux for one in own], wanted], axis=1))
+        ends = np.array(segments.get_segments())[:, :, 1]
+        np.testing.assert_allclose(ends, np.outer(wanted, [0.7, 1.6]))
+    assert len({bars[0].get_color() for bars in axes.containers}) == 2
+
+
+def test_pixels_that_are_hot_or_dead_in_either_polarity_are_left_out(monkeypatch):
+    """Pixels 1, 3 and 6 of nine, one of each kind."""
+    hot, dead = np.arange(9) == 3, (np.arange(9) == 1, np.arange(9) == 6)
+    seen = []
+
+    class Enough(Exception):
+        pass
+
+    def curve(light, polarity, good):
+        seen.append((light, polarity, good))
+        if polarity:
+            raise Enough
+
+    for name, value in (("_hot", hot), ("_dead", dead), ("_lights", ["one"])):
+        monkeypatch.setattr(figures, name, lambda bench, value=value: value)
+    monkeypatch.setattr(figures, "s_curve", curve)
+    with pytest.raises(Enough):
+        figures.event_figures(None)
+    assert [each[:2] for each in seen] == [("one", 0), ("one", 1)]
+    assert all(np.flatnonzero(~good).tolist() == [1, 3, 6] for _, _, good in seen)
+
+
+def test_what_an_s_curve_lacks_is_said():
+    """Each beside its limit: 20 pixels, 4 contrasts, a largest share of 3/4, a least of 1/4, 2 points on the slope."""
+    size, share = np.array([0.1, 0.2, 0.3, 0.4]), np.array([0.24, 0.5, 0.7, 0.76])
+    assert s_curves._problem(size, share, 20) == ""
+    assert s_curves._problem(size, share, 19).startswith("19 pixels answer; 20")
+    assert s_curves._problem(size[1:], share[1:] - 0.3, 20).startswith("steps of 3 contrasts at this light; 4")
+    assert s_curves._problem(size, np.minimum(share, 0.74), 20).startswith("the largest step is answered in 0.74")
+    assert s_curves._problem(size, np.maximum(share, 0.26), 20).startswith("the smallest step is answered in 0.26")
+    steep = s_curves._problem(size, np.array([0.01, 0.02, 0.96, 0.98]), 20)
+    assert steep and "0.2" in steep and "0.3" in steep
+    assert s_curves._problem(size, np.array([0.01, 0.04, 0.96, 0.98]), 20) == ""

@@ -1,5 +1,6 @@
 """Sensor and scene files: what ships is complete, and every mistake names file, line and key."""
 
+import math
 import re
 import typing
 import warnings
@@ -397,3 +398,61 @@ def test_a_threshold_that_would_make_billions_of_events_is_refused():
     with pytest.raises(SpecError, match=r"evs\.contrast_threshold_off.*at least 0.0001 with reference 'last_event'"):
         read_sensor("davis346", {"evs.contrast_threshold_off": 1e-6})
     assert read_sensor("eiger", {"evs.contrast_threshold_off": 1e-6}).evs.contrast_threshold_off == 1e-6
+
+
+def every_section(kind=Strict):
+    for child in kind.__subclasses__():
+        yield child
+        yield from every_section(child)
+
+
+def test_what_must_be_more_than_a_limit_must_be_more_than_nothing():
+    """Strict lower limits of numbers in files are 0, but for angles above -45°; defaults lie within their limits."""
+    strict, count = set(), 0
+    for section in set(every_section()):
+        for name, field in section.model_fields.items():
+            limits = {key: getattr(part, key) for part in field.metadata for key in ("gt", "ge", "lt", "le")
+                      if hasattr(part, key)}  # fmt: skip
+            strict |= {limits["gt"]} if "gt" in limits else set()
+            if limits and isinstance(field.default, (int, float)):
+                count += 1
+                where = f"{section.__name__}.{name}"
+                assert limits.get("gt", -math.inf) < field.default < limits.get("lt", math.inf), where
+                assert limits.get("ge", -math.inf) <= field.default <= limits.get("le", math.inf), where
+    assert strict <= {0, -45} and 0 in strict and count > 60
+
+
+def is_round(value):
+    """One digit and zeros, or a power of two, or one less."""
+    digits = f"{abs(value):.15g}".replace(".", "").partition("e")[0].strip("0")
+    whole = int(value) if float(value).is_integer() else None
+    return len(digits) <= 1 or (whole is not None and (whole & (whole - 1) == 0 or whole & (whole + 1) == 0))
+
+
+#: Limits that are no round numbers, and why: a half or a right angle, a fisheye's field, an hour and a minute, degrees
+#: Celsius of electronics and ovens, wavelengths of visible light, a lens, a signal of a thin line.
+OTHER_LIMITS = {90, 45, 170, 3600, 60, 125, 360, 830, 720, -45, 0.45, -0.45, 300, 200}
+
+
+def test_limits_and_defaults_of_numbers_are_round():
+    """So that a slip of a digit shows. Defaults have two digits at most, but for the sides of a ColorChecker, the
+    refractive index of glass and a percentile near 100."""
+    count = 0
+    for section in set(every_section()):
+        for name, field in section.model_fields.items():
+            where = f"{section.__name__}.{name}"
+            for part in field.metadata:
+                for key in ("gt", "ge", "lt", "le"):
+                    if hasattr(part, key):
+                        count += 1
+                        limit = getattr(part, key)
+                        assert is_round(limit) or limit in OTHER_LIMITS, f"{where}: {limit}"
+                        if name.endswith("_dn") and key == "le" and section.__name__ in ("ApsSpec", "InterferenceSpec"):
+                            assert limit == 2**16 - 1, where
+            if isinstance(field.default, float) and (section.__name__, name) not in (
+                ("ColorCheckerTarget", "width_m"), ("ColorCheckerTarget", "height_m"), ("ThinFilmSpec", "substrate"),
+                ("ToneExposure", "percentile"),
+            ):  # fmt: skip
+                digits = f"{abs(field.default):.15g}".replace(".", "").partition("e")[0].strip("0")
+                assert len(digits) <= 2, f"{where}: {field.default}"
+    assert count > 350

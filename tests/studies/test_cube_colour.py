@@ -9,7 +9,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.sources.cube import planes
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.spectrum import Spectrum
-from hesim_render.studies import colour_differences, colour_samples, fit_matrix
+from hesim_render.studies import colour_differences, colour_samples, cube_colour, fit_matrix
 from hesim_render.studies.colour_samples import reflectance_set
 from hesim_render.targets.cube_file import open_cube
 
@@ -54,6 +54,9 @@ def test_a_cube_of_reflectances_in_blocks(tmp_path, monkeypatch):
     again = hr.study(study).row(0)
     for key in ("delta_e_cube_mean", "delta_e_cube_p95", "delta_e_cube_max"):
         assert again[key] == pytest.approx(row[key], rel=1e-6)
+    monkeypatch.setattr(cube_colour, "_BIN", 0.4)  # the upper end of the bin in which the quantile lies
+    coarse = hr.study(study).row(0)["delta_e_cube_p95"]
+    assert coarse == pytest.approx(0.4 * np.ceil(np.quantile(errors, 0.95, method="inverted_cdf") / 0.4))
 
 
 def test_a_cube_of_radiances_has_its_own_light_and_any_unit(tmp_path):

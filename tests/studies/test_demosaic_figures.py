@@ -62,12 +62,18 @@ def test_zipper_counts_pixels_that_differ_from_their_true_likes():
 
 def test_mosaics_cost_what_their_sampling_says():
     """On grey patterns a Bayer mosaic keeps the resolution of the pixels; sparse colours give more false colour."""
-    table = hr.study({**STUDY, "filter_sets": ["rggb", "rgbw-half"], "illuminance_lux": [2000]})
+    study = {**STUDY, "filter_sets": ["rggb", "rgbw-half"], "illuminance_lux": [2000], "noise": {"repeats": 2}}
+    table = hr.study(study)
     # the pixel's own box: sinc f = 1/2 at 0.603
     assert table["mtf50_cy_per_px"][0] == pytest.approx(0.603, abs=0.02)
     # an eighth of the pixels red or blue in place of a quarter
     for figure in ("false_colour", "zone_plate_colour", "star_error"):
         assert table[figure][1] > 1.5 * table[figure][0]
+    # in this light noise adds little to what the Bayer mosaic costs, of which luminance has the least; white clips
+    bayer, half_white = table.row(0), table.row(1)
+    least = bayer["star_error"] * (LIGHT - DARK)
+    assert least < bayer["picture_error_simulated"] < 3 * least and half_white["picture_error_simulated"] > 0.1
+    assert bayer["picture_error_low"] < bayer["picture_error_simulated"] < bayer["picture_error_high"]
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
@@ -25,7 +26,7 @@ from hesim_render.studies.design import BANDS_NM as DESIGN_NM
 from hesim_render.studies.design import Problem, optimise, silicon_depth
 from hesim_render.studies.design_cost import Condition, DesignCost, Weights, best_matrix, difference_weights
 from hesim_render.studies.design_filters import Dyes, FreeCurves, ThinFilms
-from hesim_render.studies.design_run import _verdicts, design
+from hesim_render.studies.design_run import CHART_PX, _judgement, _verdicts, design
 from hesim_render.studies.design_tile import counts_of, spread_tile
 from hesim_render.studies.verdict import design_verdict
 
@@ -419,23 +420,41 @@ STUDY = {"schema_version": 1, "name": "again", "surfaces": ["cie-tcs"], "illumin
 
 
 def test_events_count_only_against_sets_that_have_event_pixels():
-    spec = DesignSpec.model_validate({**SMALL, "illuminance_lux": [20], "cost": {"events": 2.0}})
-    row = {"illuminance_lux": 20, "delta_e_mean": 1.0, "ysnr_simulated": 5.0, "ysnr_noise_aware_simulated": 6.0,
+    spec = DesignSpec.model_validate({**SMALL, "illuminance_lux": [20], "cost": {"events": 2.0, "colour": 1.7}})
+    row = {"illuminance_lux": 20, "delta_e_mean": 1.3, "ysnr_simulated": 5.0, "ysnr_noise_aware_simulated": 6.0,
            "delta_e_noisy_noise_aware_simulated": 3.0, "delta_e_noisy_noise_aware_low": 2.9,
            "delta_e_noisy_noise_aware_high": 3.1}  # fmt: skip
     table = Table([
-        {**row, "filter_set": "designed", "event_contrast_on": 0.3},
+        {**row, "filter_set": "designed", "event_contrast_on": 0.3, "mtf50_cy_per_px": 0.41},
         {**row, "filter_set": "with", "event_contrast_on": 0.5, "ysnr_simulated": 4.0,
-         "ysnr_noise_aware_simulated": 7.5},
-        {**row, "filter_set": "without"},
+         "ysnr_noise_aware_simulated": 7.5, "mtf50_cy_per_px": 0.57},
+        {**row, "filter_set": "without", "mtf50_cy_per_px": 0.63},
     ])  # fmt: skip
     both, frames_alone = _verdicts(spec, table)
     assert both["ysnr_noise_aware_ratio_20_lux"] == pytest.approx(6.0 / 7.5)
     assert both["ysnr_ratio_20_lux"] == pytest.approx(5.0 / 4.0)
-    assert both["cost"] == pytest.approx(1 + 0.5 * 3 + 2 * 0.3) and both["cost_difference"] == pytest.approx(-0.4)
-    assert frames_alone["cost"] == frames_alone["cost_against"] == pytest.approx(2.5)
+    assert both["cost"] == pytest.approx(1.7 * 1.3 + 0.5 * 3 + 2 * 0.3) and both["cost_difference"] == pytest.approx(
+        -0.4
+    )
+    assert frames_alone["cost"] == frames_alone["cost_against"] == pytest.approx(1.7 * 1.3 + 1.5)
+    assert (both["mtf50_cy_per_px"], both["mtf50_cy_per_px_against"]) == (0.41, 0.57)
     half = 0.5 * 0.1 * np.sqrt(2)
     assert both["cost_difference_high"] - both["cost_difference_low"] == pytest.approx(2 * half)
+
+
+@pytest.mark.parametrize(("rows", "cols", "fits"), [(0, 0, True), (-1, 9, False), (7, -1, False)])
+def test_a_design_is_judged_on_the_chart_where_the_sensor_holds_it(tmp_path, rows, cols, fits):
+    """By the pixels that it has more or fewer than the chart; not at all where the design says so."""
+    geometry = SimpleNamespace(rows=CHART_PX[0] + rows, cols=CHART_PX[1] + cols)
+    problem = SimpleNamespace(sensor=SimpleNamespace(spec=SimpleNamespace(geometry=geometry)))
+    spec = DesignSpec.model_validate({**SMALL, "demosaic": True, "exposure_us": 1234, "repeats": 5})
+    judged = _judgement(spec, problem, tmp_path)
+    assert judged.figures == ["colour", "noise", "events", *(["demosaic"] if fits else [])]
+    assert (
+        judged.exposures_us == [1234] and judged.noise.repeats == 5 and judged.illuminance_lux == spec.illuminance_lux
+    )
+    assert [use.name for use in judged.filter_sets] == ["designed", "Nikon"]
+    assert "demosaic" not in _judgement(DesignSpec.model_validate(SMALL), problem, tmp_path).figures
 
 
 @pytest.mark.parametrize(("changes", "message"), [

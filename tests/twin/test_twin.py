@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import warnings
 from types import SimpleNamespace
 from xml.etree import ElementTree
@@ -19,7 +20,7 @@ from hesim_render.calibrate.aps.spatial import Temporal
 from hesim_render.cli.commands import app
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.recording.pair_set import read_pair_set
-from hesim_render.twin import comparison, figures, make_twin
+from hesim_render.twin import comparison, figures, make_twin, page
 from hesim_render.twin.comparison import Check
 from hesim_render.twin.figures import bin_edges, counts_in, spectrum
 from hesim_render.twin.simulated import TwinBench
@@ -141,10 +142,12 @@ def test_the_bench_has_the_light_of_the_captures(captures):
     assert not bench.electrons(0.0).any()
 
 
-def test_errors_of_a_spectrum_are_those_of_its_noise():
-    """A fixed pattern and 400 noises: the scatter of each band over its stated error follows χ."""
+@pytest.mark.parametrize(("pixel", "shared"), [(1.7, 0.013), (0.09, 0.021)])
+def test_errors_of_a_spectrum_are_those_of_its_noise(pixel, shared):
+    """A fixed pattern and 400 noises, mostly of pixels or of what rows share: the scatter of each band over its stated
+    error follows χ."""
     rng = np.random.default_rng(5)
-    rows, cols, pixel, shared = 40, 96, 1.7, 0.013
+    rows, cols = 40, 96
     pattern = 0.8 * rng.standard_normal((rows, cols)) + 0.3 * rng.standard_normal(cols)
     found = []
     for _ in range(400):
@@ -383,3 +386,21 @@ def test_no_two_frames_of_a_bench_have_the_same_noise():
     numbers = [frame for *_, frame in drawn]
     assert numbers == [1, 2, *range(3, 12), *range(3, 12), *range(12, 23), 23, 24]
     assert {seed for _, seed, _ in drawn} == {5}
+
+
+def test_the_page_counts_the_statistics_that_pass():
+    """Two of three; each has a row, and a drawing if it has more than one value."""
+    places = np.array([3.0, 5.0, 9.0])
+
+    def check(name, z, count=3):
+        made = SimpleNamespace(
+            name=name, unit="DN", place="exposure, s", places=places[:count], real=4 + places[:count],
+            twin=4.1 + places[:count], z=np.array(z), worst=max(z, key=abs), limit=3.1, rms=1.2, most_rms=1.9,
+            passed=abs(max(z, key=abs)) < 3.1,
+        )  # fmt: skip
+        return made
+
+    checks = [check("mean, lit", [0.4, -2.2, 1.0]), check("spread", [1.3], 1), check("mean, dark", [0.1, 4.4, -0.3])]
+    text = page.page(checks, ["a bend"])
+    assert re.search(r"\b2\s+of\s+3\s+statistics\s+pass", text) and text.count("<svg") == 2 and "a bend" in text
+    assert [page.check_line(one)[:4] for one in checks] == ["pass", "pass", "FAIL"]

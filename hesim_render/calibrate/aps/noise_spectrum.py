@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import digamma
 from scipy.stats import gamma, norm
 
 from hesim_render.calibrate.estimate import ALARM
@@ -16,6 +17,11 @@ from hesim_render.calibrate.moments import Frames
 
 #: Most lines that a sensor file keeps, the strongest ones.
 _MOST_LINES = 8
+#: Cosines of the floor along an axis: one for so many pixels, and so many at most. Fewer do not follow a filter of the
+#: read-out; more follow the noise of the spectrum itself.
+_PIXELS_A_COSINE, _MOST_COSINES = 16, 8
+#: Fits of the floor, each without the lines of the one before.
+_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -63,8 +69,9 @@ class NoiseSpectrum:
 def noise_spectrum(stack: Frames, mean: NDArray) -> NoiseSpectrum:
     """Spectrum of the frames of a series about their mean.
 
-    The power of white noise, averaged over n frames, has a gamma law of shape n. A frequency is a line if its power has
-    a chance of `ALARM` for the whole spectrum. Changes that rows or columns share are no lines.
+    The power of normal noise, averaged over n frames, has a gamma law of shape n about a floor, which filters of the
+    read-out bend. A frequency is a line if its power has a chance of `ALARM` for the whole spectrum. Changes that rows
+    or columns share are no lines.
 
     Parameters
     ----------
@@ -77,16 +84,17 @@ def noise_spectrum(stack: Frames, mean: NDArray) -> NoiseSpectrum:
         power += np.abs(np.fft.rfft2(frame - mean)) ** 2
     power /= (frames - 1) * rows * cols
     inside = power[1:, 1:]
-    white = float(np.median(inside)) / float(gamma.median(frames - 1) / (frames - 1))
-    limit = white * float(gamma.isf(ALARM / inside.size, frames - 1)) / (frames - 1)
+    highest = float(gamma.isf(ALARM / inside.size, frames - 1)) / (frames - 1)
+    floor = _floor(inside, (rows, cols), frames - 1, highest)
+    limit = floor * highest
     result = []
-    for row, col in np.argwhere(power > limit):
-        mirrored = (rows - row) % rows
-        edge = col == 0 or 2 * col == cols
-        if row == 0 or col == 0 or (edge and mirrored < row):
+    for row, col in np.argwhere(inside > limit) + 1:
+        mirrored = rows - row
+        edge = 2 * col == cols
+        if edge and mirrored < row:
             continue
         parts = 1 if edge and mirrored == row else 2
-        variance = parts * float(power[row, col] - white) / (rows * cols)
+        variance = parts * float(power[row, col] - floor[row - 1, col - 1]) / (rows * cols)
         cycles = row / rows - (1 if 2 * row > rows else 0)
         result.append(InterferenceLine(float(cycles), float(col / cols), float(np.sqrt(variance))))
     lines = sorted(result, key=lambda line: -line.rms_dn)[:_MOST_LINES]
@@ -98,3 +106,30 @@ def noise_spectrum(stack: Frames, mean: NDArray) -> NoiseSpectrum:
     # without the frequency 0, which rows share, white noise would have -1/(cols - 1)
     correlation = float(np.sum(weight * inside * turn) / np.sum(weight * inside)) + 1 / (cols - 1)
     return NoiseSpectrum(lines, correlation, 1 / float(np.sqrt((frames - 1) * rows * cols)))
+
+
+def _floor(inside: NDArray, shape: tuple[int, int], frames: int, highest: float) -> NDArray[np.float64]:
+    """Power without lines: the logarithm is a short series of cosines, as that of noise behind a short filter is.
+
+    Parameters
+    ----------
+    inside : [row, col], mean power of `frames` frames; without the frequencies 0.
+    shape : rows and columns of the frames.
+    frames : number of independent frames.
+    highest : largest power over the floor that is no line.
+    """
+    series = []
+    for size, count in zip(shape, inside.shape, strict=True):
+        order = np.arange(min(size // _PIXELS_A_COSINE, _MOST_COSINES) + 1)
+        angle = 2 * np.pi / size * np.arange(1, count + 1)[:, None] * order
+        # a picture is real: its spectrum is even in both frequencies together, not in each
+        series.append((np.cos(angle), np.sin(angle[:, 1:])))
+    # the mean of the logarithm of a gamma law of mean 1 is taken off; rounded frames may lack a frequency
+    given = np.log(np.maximum(inside, max(1e-12 * float(inside.mean()), 1e-300))) - (digamma(frames) - np.log(frames))
+    logarithm = given
+    for _ in range(_ROUNDS):
+        fit = np.zeros(inside.shape)
+        for down, across in zip(*series, strict=True):
+            fit += down @ (np.linalg.pinv(down) @ logarithm @ np.linalg.pinv(across).T) @ across.T
+        logarithm = np.where(inside > highest * np.exp(fit), fit, given)
+    return np.exp(fit)

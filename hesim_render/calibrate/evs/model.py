@@ -1,11 +1,11 @@
 """Event probability against brightness, as the calibration fits it (Eqs. 9–12 of the paper, corrected).
 
     u(I) = Θ (A I + B) / √(2 g),   g = 1 + 2 D y + y²,   y = C I ("linear") or C √I ("sqrt" shot law)
-    P₊ = Q((1 − ρ) r u / √(1 + m² u²)) + λ,     P₋ = Q((1 + ρ) r u / √(1 + m² u²))
+    P₊ = Q(r u₊ / √(1 + m² u₊²)) + λ,  u₊ = (1 − ρ) u,     P₋ = Q(r u₋ / √(1 + m² u₋²)),  u₋ = (1 + ρ) u
 
 A = β0β1/β4, B = β0β2/β4, C = β3/β4, D = β5; u = θ/σ_n, ρ = (θ₋ − θ₊)/(θ₋ + θ₊), λ leak events per trial.
-r is the known threshold of a pixel relative to the mean of all, and m the relative standard deviation of the
-unknown part: the mean of Q(u (r + m z)) over a normal z is exactly Q(r u / √(1 + m² u²)).
+r is the known threshold of a pixel relative to the mean of its polarity, and m the standard deviation of the unknown
+part, relative to the same mean: the mean of Q(u (r + m z)) over a normal z is exactly Q(r u / √(1 + m² u²)).
 """
 
 from __future__ import annotations
@@ -89,13 +89,15 @@ def log_probability(parameters: NDArray, cells: Cells, theta_v: float, law: Law)
     u, slopes = threshold_over_noise(parameters, cells.signal_dn, theta_v, law)
     rho, leak = parameters[..., 4, None], parameters[..., 5, None]
     on = cells.polarity > 0
-    scale = over_thresholds(u, cells.relative, cells.spread, NUMPY)
-    v = (1 - cells.polarity * rho) * scale
+    # the spread of thresholds is relative to the mean of the polarity, so that ρ comes before the mean over it
+    own = (1 - cells.polarity * rho) * u
+    v = over_thresholds(own, cells.relative, cells.spread, NUMPY)
+    flatter = 1 + (cells.spread * own) ** 2
     logarithm = log_ndtr(-v)
     hazard = np.exp(-0.5 * v * v - _HALF_LOG_2PI - logarithm)
     jacobian = np.zeros((*v.shape, 6))
-    jacobian[..., :4] = (-hazard * v / (1 + (cells.spread * u) ** 2))[..., None] * slopes
-    jacobian[..., 4] = hazard * cells.polarity * scale
+    jacobian[..., :4] = (-hazard * v / flatter)[..., None] * slopes
+    jacobian[..., 4] = hazard * cells.polarity * cells.relative * u / flatter**1.5
     with np.errstate(divide="ignore"):
         both = np.where(on, np.logaddexp(logarithm, np.log(leak)), logarithm)
     jacobian *= np.exp(logarithm - both)[..., None]

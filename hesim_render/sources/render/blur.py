@@ -8,7 +8,7 @@ sums of independent δ. The PSF of a pixel is that of the image height of its ce
 from __future__ import annotations
 
 from functools import cache
-from math import pi
+from math import log, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ FWHM_PER_SIGMA = 2.3548200450309493  # 2 √(2 ln 2)
 _HEIGHTS, _LEAST_SIGMA_PX = 1024, 1e-4
 #: Parts of the light of an Airy pattern whose radii are tabulated; the last one follows the law of the far rings.
 _AIRY_PARTS = 1 << 14
-#: Part of the light of a kernel that lies within its stated reach.
+#: Part of the light of a PSF that lies within its stated reach.
 _MOST_LIGHT = 0.98
 
 
@@ -82,7 +82,7 @@ class GaussianBlur:
         sigma_px = np.array(widths) / FWHM_PER_SIGMA / pitch_um
         self._widest = dr.opaque(types.Float, float(sigma_px.max()))
         #: Radius that holds nearly all of it, px.
-        self.reach_px = float(2 * sigma_px.max())
+        self.reach_px = float(sqrt(-2 * log(1 - _MOST_LIGHT)) * sigma_px.max())
         self._of_height = None
         if isinstance(psf, GaussianPsf) and len(widths) > 1:
             self._of_height = _OverHeight(sensor, psf.image_height_mm, np.maximum(sigma_px, _LEAST_SIGMA_PX))

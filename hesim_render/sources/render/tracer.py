@@ -285,7 +285,7 @@ class PixelTracer(Tracer):
         offset = self.rays.offset(aperture, blur, place)
         if self.rays.is_dispersive:
             # a single wavelength from the law of all four: the k-th one belongs to the k-th quarter of the numbers
-            quarter = dr.minimum(types.UInt32(choice * 4), 3)
+            quarter = types.UInt32(choice * 4)
             four = wavelengths(pixel, choice * 4 - types.Float(quarter))
             single = four[3]
             for k in range(3):

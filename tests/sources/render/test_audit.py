@@ -514,3 +514,14 @@ def test_deviations_are_those_of_units_that_were_all_examined():
     tally.note(np.array([1]), np.array([[2.0]]), np.array([0.25]))
     deviation, weight = tally.deviations()
     assert deviation.tolist() == [1.0, 2.0, 3.0] and weight.tolist() == [0.5, 0.25, 0.5]
+
+
+def test_a_change_of_exactly_the_threshold_is_no_event_of_pixels_with_ticks():
+    """They compare with more than the threshold: ±0.375 and ±0.5 in binary, where a change can be equal to it."""
+    theta = np.array([0.375, 0.375, 0.375]), np.array([0.5, 0.5, 0.5])
+    more = 2.0**-20
+    change = np.array([[0.375, 0.375 + more, -0.5], [-0.5, -0.5 - more, 0.375], [0.0, 0.0, 0.0]])
+    signal = np.concatenate([np.zeros((1, 3)), np.cumsum(change, axis=0)])
+    counted = compare_ticks(signal, signal, np.full(signal.shape, 0.01), theta, np.ones(4, np.bool_))
+    np.testing.assert_array_equal(counted.true, [0, 2, 0])
+    np.testing.assert_array_equal(counted.in_run, [0, 2, 0])

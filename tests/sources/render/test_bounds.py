@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.motion_bounds import fastest_m_per_s, places, places_seen, stays_in
@@ -70,8 +71,13 @@ def test_what_comes_for_a_moment_is_in_the_box():
 
 
 def test_straight_lines_between_places_are_within_their_margin():
-    turning = track({"t_us": 0}, {"t_us": 10_000, "rotation_axis": [0, 0, 1], "rotation_deg": 900})
+    turning = track({"t_us": 0}, {"t_us": 10_000, "rotation_axis": [0, 0.2, 1], "rotation_deg": 700})
     ((points, margin),) = places(CORNERS, turning, 1000.0, 3000.0)
+    # from 70° to 210° in the sense of a right-handed screw
+    axis = np.array([0, 0.2, 1]) / np.sqrt(1.04)
+    for k, angle_deg in ((0, 70), (-1, 210)):
+        wanted = Rotation.from_rotvec(np.radians(angle_deg) * axis).apply(CORNERS)
+        np.testing.assert_allclose(points[k], wanted, atol=1e-9)
     share = np.linspace(0, 1, 40)[:, None, None, None]
     lines = points[:-1] + share * np.diff(points, axis=0)
     poses = turning.matrix(np.linspace(1000.0, 3000.0, 400))

@@ -1,5 +1,6 @@
 """Environment maps give the level that is asked for, from the right side."""
 
+import contextlib
 import json
 
 import numpy as np
@@ -8,7 +9,9 @@ from rendering import flux_image, mono
 
 import hesim_render as hr
 from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.scene import environment
 from hesim_render.sources.render.scene.mitsuba_version import files_readable, mitsuba
+from hesim_render.specs.light import LightSpec
 
 ROWS, COLS = 64, 128
 THETA = np.linspace(0, np.pi, ROWS)[:, None]
@@ -85,6 +88,20 @@ def test_wrong_maps_are_told(tmp_path, light, told):
     (tmp_path / "bad.exr").write_bytes(b"not a picture")
     with pytest.raises(SpecError, match=told):
         flux(tmp_path, {"type": "environment", "illuminance_lux": 500, **light}, samples=4)
+
+
+@pytest.mark.parametrize(("level", "fits"), [(1.02e-9, True), (0.98e-9, False), (0.0, False)])
+def test_a_map_gives_light_to_the_plane_from_a_part_of_its_brightest_place_on(tmp_path, monkeypatch, level, fits):
+    """A thousand millionth of the brightest texel, 37.5: light in W m⁻² is scaled by the level that the map gives."""
+    values = np.full((ROWS, COLS), 3.0)
+    values[9, 40] = 37.5
+    write_map(tmp_path, values)
+    monkeypatch.setattr(environment, "level_on_plane", lambda *_, **__: 37.5 * level)
+    given = {"type": "environment", "file": "map.exr", "irradiance_w_m2": 2.6}
+    light = LightSpec.model_validate(given, context={"folder": tmp_path})
+    with contextlib.nullcontext() if fits else pytest.raises(SpecError, match="no light to the plane"):
+        found = environment.environment(mitsuba(), light, np.array([0.0, 0.0, 1.0]), "light")
+        assert found["scale"] == pytest.approx(2.6 / (37.5 * level))
 
 
 def test_one_light_from_everywhere(tmp_path):

@@ -12,6 +12,7 @@ import hesim_render as hr
 from hesim_render import cli
 from hesim_render.core.errors import RangeError
 from hesim_render.describe import motion_figures, motion_lines
+from hesim_render.sources.render.truth import motion_look as look
 from hesim_render.sources.render.truth.motion_look import _bursts, _compared, motion_look
 
 #: Reflectances of card and wall, and px of the picture by which the card moves to the right in the run.
@@ -77,6 +78,26 @@ def test_fixed_ticks_give_one_event_a_change_or_none_where_it_is_slow():
     assert 2 * PATH_PX * 11 < fast.mean_hz * DURATION_US * 1e-6 < 2 * 3.5 * PATH_PX * 11
     slow = motion_look(sliding(0.8), sensor, 0.0, DURATION_US).events
     assert slow.mean_hz == 0  # 0.016 px a tick
+
+
+@pytest.mark.parametrize(("speed", "ticks"), [(300.0, 2), (90.0, 5), (4_000.0, 1)])
+def test_samples_of_pixels_with_ticks_are_whole_ticks_apart(speed, ticks, monkeypatch):
+    """As many as the fastest point takes for a third of a pixel, 700 µs each; ln of the light goes on a line, so that
+    a pixel has an event at each tick or at none."""
+    rows, cols, seen = 6, 9, []
+    slope = np.linspace(-6e-4, 5e-4, rows * cols).reshape(rows, cols)  # by µs: -0.42 to 0.35 of a tick
+    grid = np.mgrid[:rows, :cols]
+    raster = SimpleNamespace(shape=(rows, cols), row=grid[0], col=grid[1])
+    monkeypatch.setattr(look.Raster, "of", lambda sensor, name: raster)
+    monkeypatch.setattr(look, "_seen", lambda rays, col, row, t_us: seen.append(t_us) or np.exp(3 + slope * t_us))
+    spec = SimpleNamespace(
+        tick_us=700, reference="previous_sample", contrast_threshold_on=0.2, contrast_threshold_off=0.3
+    )
+    found = look._events(SimpleNamespace(sensor=None), spec, 60_000, speed)
+    assert np.unique(np.diff(seen)).tolist() == [700 * ticks] and seen[0] == 0
+    fires = (700 * slope >= 0.2) | (-700 * slope >= 0.3)
+    np.testing.assert_allclose(found.density_hz, np.where(fires, 1e6 / 700, 0), rtol=1e-9)
+    np.testing.assert_allclose(found.rates_hz, fires.sum() * 1e6 / 700, rtol=1e-9)
 
 
 def test_bursts_cover_a_short_run_and_are_spread_over_a_long_one():

@@ -94,6 +94,16 @@ def test_a_lens_with_distortion_is_opencvs_both_ways_and_on_the_device(name):
     assert np.abs(projection.project(way) - expected).max() < 1e-3
     seen_col, seen_row, _ = factory.seen(origin + 3 * direction)
     assert np.abs(np.stack([np.array(seen_col), np.array(seen_row)], axis=1) - expected).max() < 0.005
+    # beyond the largest tangent of the model, points are seen where they would be at it
+    limit, around = projection.distortion.limit, np.radians([10.0, 77.0, 160.0, 250.0, 305.0])
+    if limit < 100:
+        seen = []
+        for radius in (limit, 1.4 * limit, 9 * limit):
+            away = np.stack([radius * np.cos(around), radius * np.sin(around), -np.ones(5)], axis=-1)
+            points = 2.3 * away @ view.camera_to_world[:3, :3].T + view.camera_to_world[:3, 3]
+            point = types.Array3f(*(types.Float(side.astype(np.float32)) for side in points.T))
+            seen.append(np.stack([np.array(place) for place in factory.seen(point)[:2]], axis=-1))
+        np.testing.assert_allclose(seen[1:], [seen[0]] * 2, atol=0.05)
 
 
 def test_a_target_fills_the_picture_of_a_lens_with_distortion_too():

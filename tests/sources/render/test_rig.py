@@ -54,6 +54,8 @@ def test_kalibr_gets_the_extrinsics(tmp_path):
     np.testing.assert_allclose(chain["cam1"]["T_cn_cnm1"], np.linalg.inv(RIGHT), atol=1e-7)
     np.testing.assert_allclose(chain["cam1"]["T_cam_imu"], np.linalg.inv(RIGHT), atol=1e-7)
     np.testing.assert_allclose(chain["cam0"]["T_cam_imu"], np.eye(4), atol=1e-9)
+    # a lens without distortion has all four coefficients that Kalibr wants
+    assert [chain[name]["distortion_coeffs"] for name in ("cam0", "cam1")] == [[0.0] * 4] * 2
 
 
 def test_rigs_that_are_none_are_refused():

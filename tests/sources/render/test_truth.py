@@ -1,5 +1,7 @@
 """Geometric truth against closed forms written out here, and against pictures of the exact renderer."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import rendering
@@ -8,11 +10,13 @@ from scipy.spatial.transform import Rotation
 
 import hesim_render as hr
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.sources.render.light_level import light_levels
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.truth import imu
 from hesim_render.sources.render.truth.imu import ImuModel
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 from hesim_render.specs.motion import TrackSpec
+from hesim_render.spectral.waveform import Mains, Pwm, TableWaveform
 
 WHITE, BLACK = {"reflectance": {"flat": 1.0}}, {"reflectance": {"flat": 0.0}}
 #: A card that turns and moves sideways, a ball that flies in front of it, and a wall; the camera turns and moves.
@@ -427,6 +431,39 @@ def test_light_levels_follow_the_waveform():
     (light,) = SceneTruth(flickering, rendering.mono(8, 8)).light_levels([0.0, 2_500.0, 5_000.0])
     np.testing.assert_allclose(light.level, [1400, 1000, 600], rtol=1e-9)
     assert (light.name, light.unit, light.mean) == ("light", "lx", 1000.0)
+
+
+def test_levels_of_several_lights_lamps_and_emitters():
+    """Each by its law: 1 + d cos(2π 2f t + φ), 1/duty while switched on, a line between samples over its mean."""
+    t_us = np.array([[0.0, 1_234.0], [7_300.0, 31_000.0]])
+    mains = Mains(frequency_hz=60, depth=0.3, phase_deg=25)
+    pwm = Pwm(frequency_hz=400, duty=0.35, phase_deg=50)
+    table = TableWaveform(t_us=(0.0, 8_000.0, 40_000.0), value=(3.0, 1.0, 5.0))
+    of_mains = 1 + 0.3 * np.cos(2 * np.pi * 120 * t_us * 1e-6 + np.radians(25))
+    of_pwm = np.where((400e-6 * t_us + 50 / 360) % 1 < 0.35, 1 / 0.35, 0)
+    # its mean is that of two trapezoids
+    of_table = np.interp(t_us, [0, 8_000, 40_000], [3, 1, 5]) / ((2 * 8_000 + 3 * 32_000) / 40_000)
+
+    def light(waveform, lux=None, watts=None, kind="uniform"):
+        given = None if waveform is None else SimpleNamespace(load=lambda: waveform)
+        return SimpleNamespace(type=kind, illuminance_lux=lux, irradiance_w_m2=watts, waveform=given)
+
+    def lamp(waveform, luminance):
+        return SimpleNamespace(luminance_cd_m2=luminance, waveform=light(waveform).waveform)
+
+    emitters = SimpleNamespace(waveforms={"tube": light(pwm).waveform})
+    lights = [light(mains, lux=730.0), light(None, kind="none"), light(pwm, watts=2.6), light(None, lux=40.0)]
+    lamps = [("target", lamp(table, 310.0)), ("objects.led", lamp(None, 90.0))]
+    spec = SimpleNamespace(lights=lights, named_lamps=lamps, mitsuba=emitters)
+    found = light_levels(SimpleNamespace(spec=spec), t_us)
+    wanted = [
+        ("lights.0", "lx", 730.0, 730 * of_mains), ("lights.2", "W m^-2", 2.6, 2.6 * of_pwm),
+        ("lights.3", "lx", 40.0, np.full((2, 2), 40.0)), ("target", "cd m^-2", 310.0, 310 * of_table),
+        ("objects.led", "cd m^-2", 90.0, np.full((2, 2), 90.0)), ("tube", "1", 1.0, of_pwm),
+    ]  # fmt: skip
+    for one, (name, unit, mean, level) in zip(found, wanted, strict=True):
+        assert (one.name, one.unit, one.mean) == (name, unit, mean)
+        np.testing.assert_allclose(one.level, level, rtol=1e-9)
 
 
 # ---- inertial measurements -----------------------------------------------------------------------------------------

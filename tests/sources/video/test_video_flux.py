@@ -1,6 +1,7 @@
 """The video as a source of flux: time, geometry, and what the capture loop makes of it."""
 
 import gc
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from videos import moving_bar, srgb_to_linear
 import hesim_render as hr
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sources.video import VideoFlux, VideoOptions, flux
+from hesim_render.sources.video import estimate as video_estimate
 from hesim_render.sources.video.arrays import ArrayVideo
 from hesim_render.sources.video.clock import Clock
 from hesim_render.sources.video.geometry import mapping
@@ -510,6 +512,28 @@ def test_the_estimate_holds_the_time_to_decode(monkeypatch):
     assert given[:first] == list(range(1, first + 1)) and 5 < first < 15
     assert given[first:] == list(range(20))
     assert (whole.pictures, whole.event_samples) == (plain.pictures, plain.event_samples)
+
+
+@pytest.mark.parametrize("tick_us", [None, 700])
+def test_the_estimate_is_the_sum_of_pixels_items_and_decoding(monkeypatch, tick_us):
+    """Pixels are shared among the cores; pictures, comparisons and frames are not, nor is decoding. By hand."""
+    monkeypatch.setattr(video_estimate, "_PER_PIXEL_S", np.array([3e-7, 5e-7, 11e-7]))
+    monkeypatch.setattr(video_estimate, "_PER_ITEM_S", np.array([0.013, 0.0017, 0.19]))
+    monkeypatch.setattr(video_estimate, "_IN_ALL_S", 2.3)
+    monkeypatch.setattr(video_estimate.os, "cpu_count", lambda: 3)
+    spec = SimpleNamespace(aps=SimpleNamespace(frame_rate_hz=60.0), evs=SimpleNamespace(tick_us=tick_us))
+    given = SimpleNamespace(spec=spec, layout=SimpleNamespace(shape=(40, 52), evs_shape=(20, 13)))
+    found = video_estimate.estimate_of_counts(given, 90_000, 17, 0.021)
+    # 0.09 s: 5.4 frames; 128 ticks of 700 µs, or a sample a picture
+    samples = 17 if tick_us is None else 128
+    on_cores = 17 * 40 * 52 * 3e-7 + samples * 20 * 13 * 5e-7 + 5 * 40 * 52 * 11e-7
+    wanted = on_cores / 3 + 17 * 0.013 + samples * 0.0017 + 5 * 0.19 + 2.3 + 17 * 0.021
+    assert found.seconds == pytest.approx(wanted, rel=1e-12)
+    assert (found.pictures, found.event_samples, found.frames) == (17, samples, 5)
+    spec.aps = spec.evs = None
+    none = video_estimate.estimate_of_counts(given, 90_000, 17, 0.021)
+    assert none.seconds == pytest.approx(17 * 40 * 52 * 3e-7 / 3 + 17 * 0.013 + 2.3 + 17 * 0.021, rel=1e-12)
+    assert (none.event_samples, none.frames) == (0, 0)
 
 
 def test_only_pictures_of_the_run_are_read_for_the_estimate():

@@ -62,7 +62,7 @@ def environment(mi: MitsubaModule, light: LightSpec, normal: NDArray[np.float64]
 
     in_lux = light.illuminance_lux is not None
     level = level_on_plane(mi, mi.load_dict(plugin(1.0)), values.shape[:2], pose[:3, :3], normal, in_lux=in_lux)
-    if not level > _LEAST * max(float(values.max()), 1e-30):
+    if not level > _LEAST * float(values.max()):
         raise SpecError("the environment map gives no light to the plane (see plane_normal)", key=key)
     wanted = light.illuminance_lux if light.illuminance_lux is not None else light.irradiance_w_m2
     return plugin(float(wanted or 0.0) / level)
