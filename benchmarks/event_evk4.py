@@ -10,7 +10,7 @@ take a saddle-point approximation of these chances, which is within 6 % of the s
 The threshold, its spread, the dead time and both floors of our pixel are theirs. What theirs does not state for a pixel
 that remembers the level of its last event, five figures, is fitted: at all lights, and at every second one, where the
 other half of the lights is predicted. The corner comes to its limit gradually; in one fit it ends abruptly. The last
-fit takes the limit from the sensor's data sheet. Each fit prints the photo-electrons whose shot noise its noise would be.
+fit takes the limit from the data sheet. Each fit prints the photo-electrons whose shot noise its noise would be.
 """
 
 import numpy as np
