@@ -57,6 +57,8 @@ class Stream(IntEnum):
     COLUMN_OFFSET = 70
     COLUMN_NOISE = 71
     INTERFERENCE = 72
+    COMPARATOR_ON = 73
+    COMPARATOR_OFF = 74
 
 
 def stream_key(seed: int, stream: Stream) -> int:

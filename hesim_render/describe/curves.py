@@ -27,7 +27,7 @@ class EventCurves:
     ----------
     lux : [n], illuminance, lx.
     sigma : [n], standard deviation of ln x.
-    on_hz, off_hz : [n], events of a pixel in steady light, leak included, 1/s.
+    on_hz, off_hz : [n], events of a pixel in steady light, with leak and comparator noise, 1/s.
     latency_us : [n], time from a step of `step` to an ON event, without noise; NaN where the step is too small.
     shot_limit : [n], standard deviation of ln of the light that the shot noise of the photo-electrons alone would have
         in the same bandwidth (in the same window at a fixed tick).
@@ -87,12 +87,18 @@ class _Pixel:
                 float(formulas.exceedance(theta, math.sqrt(2 * variance + (self.mismatch * theta) ** 2)))
                 for theta in self.thresholds
             )
-            return (on + (1 - on - off) * formulas.leak_probability(leak_hz, tick_s)) / tick_s, off / tick_s
+            # at most one event a tick: the comparison first, then the leak, then the comparators' own noise
+            leak = formulas.leak_probability(leak_hz, tick_s)
+            chances = [formulas.leak_probability(hz, tick_s) for hz in self.noise.comparator_noise_hz]
+            free = (1 - on - off) * (1 - leak)
+            return (on + (1 - on - off) * leak + free * chances[0]) / tick_s, (off + free * chances[1]) / tick_s
         assert self.spec.photoreceptor_cutoff_hz is not None
         dead_s = (self.noise.refractory_period_us or 0) * S_PER_US
         bandwidth_hz = share * self.spec.photoreceptor_cutoff_hz
-        on, off = noise_rates_hz(self.thresholds, self.mismatch, math.sqrt(variance), bandwidth_hz, dead_s, leak_hz)
-        return on + leak_hz, off
+        own = self.noise.comparator_noise_hz
+        resets_hz = leak_hz + sum(own)
+        on, off = noise_rates_hz(self.thresholds, self.mismatch, math.sqrt(variance), bandwidth_hz, dead_s, resets_hz)
+        return on + leak_hz + own[0], off + own[1]
 
     def shot_limit(self, lux: NDArray[np.float64]) -> NDArray[np.float64]:
         """σ = √(1/N) of the electrons of a window; of band-limited noise √((2/Φ)·(π/4)·f₀), f₀ = f/√(√2 − 1)."""

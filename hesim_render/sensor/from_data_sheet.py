@@ -65,6 +65,7 @@ class Figures:
     bandwidth_hz : of the noise; None for that of the highest corner.
     filters_noise : whether the corners limit it.
     leak_hz : rate of leak events.
+    own_hz : rate of the events of the comparators' own noise.
     corners : illuminance in lx and corner frequency in Hz, none to two of them.
     dead_us : dead time, µs; None for none.
     shot_law : law of the noise; with two rates and "linear", σ is (β3 L + β4)/(L + L₀).
@@ -80,10 +81,17 @@ class Figures:
     corners: list[tuple[float, float]]
     dead_us: int | None
     shot_law: Literal["linear", "sqrt"] = "sqrt"
+    own_hz: float = 0.0
 
     @classmethod
-    def of_data_sheet(cls, sheet: DataSheetSpec) -> Figures:
+    def of_data_sheet(cls, sheet: DataSheetSpec, own_hz: float = 0.0) -> Figures:
         """Figures of a data sheet. A latency is that of an ON event; the corner is that of the light after the step."""
+        for stated in sheet.background:
+            if stated.rate_hz <= sheet.leak_hz + own_hz:
+                raise SpecError(
+                    f"background of {stated.rate_hz:g} Hz at {stated.lux:g} lx is not above leak and comparator_noise, "
+                    f"{sheet.leak_hz + own_hz:g} Hz together: nothing is left for the noise of the light"
+                )
         contrasts = [0.01 * value for value in (sheet.threshold_on_percent, sheet.threshold_off_percent)]
         on, off = (math.log1p(contrast) for contrast in contrasts)
         # dθ = dc/(1 + c)
@@ -98,8 +106,10 @@ class Figures:
                 change = math.log1p(step * level.lux / (level.lux + sheet.dark_lux))
                 corners.append((level.lux * (1 + step), corner_of_latency_hz(level.latency_us, on, change)))
         return cls(
-            (on, off), spread / ((on + off) / 2), [(b.lux, b.rate_hz - sheet.leak_hz) for b in sheet.background],
+            (on, off), spread / ((on + off) / 2),
+            [(level.lux, level.rate_hz - sheet.leak_hz - own_hz) for level in sheet.background],
             sheet.dark_lux, sheet.noise_cutoff_hz, bool(sheet.speed), sheet.leak_hz, corners, sheet.refractory_us,
+            own_hz=own_hz,
         )  # fmt: skip
 
     @classmethod
@@ -189,7 +199,9 @@ def derive(data: CommentedMap, spec: SheetSensorSpec, file: Path) -> None:
 def _values(spec: SheetSensorSpec) -> dict[str, Any]:
     evs = spec.evs
     if evs.data_sheet is not None:
-        figures, light = Figures.of_data_sheet(evs.data_sheet), evs.data_sheet.light.load()
+        own = evs.comparator_noise
+        own_hz = 0.0 if own is None else own.on_hz + own.off_hz
+        figures, light = Figures.of_data_sheet(evs.data_sheet, own_hz), evs.data_sheet.light.load()
     else:
         assert evs.v2e is not None
         figures, light = Figures.of_v2e(evs.v2e), evs.v2e.light.load()
@@ -228,7 +240,12 @@ def _noise(figures: Figures, bandwidth_hz: float, photoreceptor: Mapping[str, fl
             limits = photoreceptor["min_cutoff_hz"], photoreceptor["cutoff_hz"]
             share = min(corner_line(min(lux / photoreceptor["signal_dn"], 1.0), *limits) / bandwidth_hz, 1.0)
         sigma = noise_sigma(
-            rate_hz, figures.thresholds, figures.mismatch, share * bandwidth_hz, dead_s, figures.leak_hz
+            rate_hz,
+            figures.thresholds,
+            figures.mismatch,
+            share * bandwidth_hz,
+            dead_s,
+            figures.leak_hz + figures.own_hz,
         )
         return sigma**2 / share
 

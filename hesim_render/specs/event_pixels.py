@@ -72,6 +72,10 @@ class PhotoreceptorSpec(Strict):
         False, description="the noise (last_event) passes it too: below photoreceptor_cutoff_hz its bandwidth is the "
         "corner, and its variance falls with it"
     )  # fmt: skip
+    approach: Literal["abrupt", "gradual"] = Field(
+        "abrupt", description="how the corner comes to cutoff_hz: a line up to it, or time constants of light and bias "
+        "add up, which takes a decade of light"
+    )  # fmt: skip
 
     @model_validator(mode="after")
     def _check(self) -> PhotoreceptorSpec:
@@ -84,7 +88,18 @@ class PhotoreceptorSpec(Strict):
             raise ValueError("without follows_light the corner is cutoff_hz: leave signal_dn and min_cutoff_hz out")
         elif self.filters_noise:
             raise ValueError("filters_noise needs follows_light; otherwise photoreceptor_cutoff_hz says the same")
+        elif self.approach == "gradual":
+            raise ValueError("approach 'gradual' needs follows_light; a corner that is the same in any light has none")
         return self
+
+    def series_hz(self, limit_hz: float = 0.0) -> float | None:
+        """Corner in series with that of the light, Hz; None where the approach is abrupt.
+
+        Parameters
+        ----------
+        limit_hz : that corner; 0: cutoff_hz.
+        """
+        return (limit_hz or self.cutoff_hz) if self.approach == "gradual" else None
 
 
 #: Fastest leak of the pixels in the tail, Hz.
@@ -127,6 +142,13 @@ class LeakSpec(Strict):
         return self.rate_hz + self.rate_hz_per_dn * signal_dn + tail_hz
 
 
+class ComparatorNoiseSpec(Strict):
+    """Events of the comparators' own noise: a Poisson process of each polarity, whatever the light."""
+
+    on_hz: float = Field(0.0, ge=0, le=1e6, description="ON events per pixel")
+    off_hz: float = Field(0.0, ge=0, le=1e6, description="OFF events per pixel")
+
+
 #: Smallest threshold if a change gives one event per threshold that it contains.
 _LEAST_THRESHOLD = 1e-4
 
@@ -163,6 +185,9 @@ class SheetEvsSpec(Strict):
     data_sheet: DataSheetSpec | None = Field(None, description="figures that the values above follow from")
     v2e: V2eSpec | None = Field(None, description="options of v2e that they follow from")
     leak: LeakSpec | None = Field(None, description="in place of leak_rate_hz: which process the leak is")
+    comparator_noise: ComparatorNoiseSpec | None = Field(
+        None, description="events of both polarities at random times, whatever the light; default none"
+    )
     defects: EventDefectSpec | None = Field(None, description="stuck, hot and flickering pixels; default none")
     readout_max_events_per_s: float | None = Field(
         None, ge=1e-3, le=1e12, description="events beyond are lost; default no limit"

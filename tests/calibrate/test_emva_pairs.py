@@ -42,6 +42,7 @@ def truth(camera):
         "read_noise_e": camera.read_noise,
         "dark_current_e_per_s": camera.dark_current,
         "row_noise_dn": camera.row_noise,
+        "temporal_dark_noise_e": np.hypot(camera.read_noise, camera.row_noise / camera.gain),
         "dsnu_e": np.sqrt(sum(part**2 for part in camera.dsnu)),
         "prnu_percent": 100 * np.sqrt(sum(part**2 for part in camera.prnu)),
     }
@@ -121,6 +122,23 @@ def test_saturation_is_between_the_levels_around_it(sections):
     for section in sections[:10]:
         low, high = section["full_well_e"]["interval_95"]
         assert low < full_well < high and section["full_well_e"]["limited_by"] == "ADC full scale"
+
+
+@pytest.mark.parametrize("limited_by", ("ADC full scale", "full well"))
+def test_where_the_signal_ends_lies_in_its_interval_wherever_the_levels_are(limited_by):
+    """36 of 40 or more; the levels, 670 e⁻ apart, fall anywhere. The standard's value itself is one of the levels."""
+    hits = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        camera = CAMERA.but(photons_per_us=CAMERA.photons_per_us * rng.uniform(0.93, 1.07))
+        end, kept = (2**camera.bits - 1 - camera.black) / camera.gain, {}
+        if limited_by == "full well":  # the pixels hold less than the ADC could tell
+            end = rng.uniform(8500, 10_100)
+            kept = {"full_well": end}
+        found = content(evaluate(emva_camera.in_memory(camera.but(**kept), seed)))["full_well_e"]
+        assert found["limited_by"] == limited_by
+        hits += found["interval_95"][0] < end < found["interval_95"][1]
+    assert hits >= 36
 
 
 def test_what_the_standard_lacks_is_measured():

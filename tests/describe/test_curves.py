@@ -10,7 +10,7 @@ from scipy import integrate, special
 import hesim_render as hr
 from hesim_render.core import drawing
 from hesim_render.core.backend import jit
-from hesim_render.core.errors import RangeError
+from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.describe import event_curves, figures_of, photon_transfer, picture, s_curve, table_lines
 from hesim_render.describe.table import TABLE_LUX
 from hesim_render.pixels.evs.noise_rates import events_per_period
@@ -139,6 +139,41 @@ def test_rare_background_with_its_leak(name, pixels):
     drawn = of_drawn_thresholds(sensor, stated.lux)
     assert found == pytest.approx(drawn, rel=0.05)  # 10,000 events or more
     assert of_drawn_thresholds(whole, stated.lux) * found / drawn == pytest.approx(stated.rate_hz, rel=0.05)
+
+
+def test_comparator_noise_is_in_the_rates():
+    """Without other noise the rates are its own; a stated background holds it, and less is left for the light."""
+    own = {"on_hz": 0.013, "off_hz": 0.029}
+    silent = {"evs.coefficients.0.beta3": 0.0, "evs.coefficients.0.beta4": 0.0, "evs.leak_rate_hz": 0.17}
+    for name, leak_hz in (("davis346", 0.17), ("eiger", 0.17)):
+        curves = event_curves(hr.load_sensor(name, {**silent, "evs.comparator_noise": own}), [7.0])
+        assert curves.on_hz[0] == pytest.approx(leak_hz + own["on_hz"], rel=1e-3)
+        assert curves.off_hz[0] == pytest.approx(own["off_hz"], rel=1e-3)
+    plain, noisy = hr.load_sensor("davis240"), hr.load_sensor("davis240", {"evs.comparator_noise": own})
+    (stated,) = noisy.spec.evs.data_sheet.background
+    curves, without = (event_curves(sensor, [stated.lux]) for sensor in (noisy, plain))
+    assert curves.on_hz[0] + curves.off_hz[0] == pytest.approx(stated.rate_hz, rel=1e-3)
+    assert curves.sigma[0] < without.sigma[0]
+    with pytest.raises(SpecError, match="is not above leak and comparator_noise"):
+        hr.load_sensor("davis240", {"evs.comparator_noise": {"off_hz": stated.rate_hz}})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lux", (0.4, 6.0, 30.0))
+def test_rates_of_a_gradual_corner_and_comparator_noise(lux):
+    """The closed form and a simulation, where light, bias and the comparators each have a part of the events."""
+    changes = {
+        "evs.photoreceptor_cutoff_hz": 210.0, "evs.comparator_noise": {"on_hz": 0.6, "off_hz": 1.7},
+        "evs.photoreceptor": {
+            "cutoff_hz": 340.0, "signal_dn": 900.0, "min_cutoff_hz": 4.0, "filters_noise": True, "approach": "gradual",
+        },
+        "evs.refractory_period_us": 150,
+    }  # fmt: skip
+    sensor = hr.load_sensor("davis346", changes).crop(64, 64)
+    curves = event_curves(sensor, [lux])
+    found = simulated_rates(sensor, lux, 0.5, 4.0)
+    # 10,000 events or more of pixels that differ: 5 % is four standard errors
+    assert found == pytest.approx((curves.on_hz[0], curves.off_hz[0]), rel=0.06)
 
 
 def test_rates_in_dim_light_fall_with_the_pixels_speed():

@@ -127,14 +127,17 @@ def test_filter_does_not_depend_on_the_samples(spec):
     assert np.std(arms[0][-1]) > 0.1
 
 
+@pytest.mark.parametrize("approach", ("abrupt", "gradual"))
 @pytest.mark.parametrize("signal_dn", (0.2, 10.0, 40.0, 100.0, 5000.0))
-def test_corner_follows_the_light(signal_dn):
-    """Small ripples at 30 Hz on constant light: the corner rises from that of the dark to its largest at signal_dn."""
-    corner = min(3.0 + (CUTOFF_HZ - 3.0) * signal_dn / 100.0, CUTOFF_HZ)
+def test_corner_follows_the_light(signal_dn, approach):
+    """Small ripples at 30 Hz on constant light: the corner rises from that of the dark to its largest at signal_dn, or
+    is half of it there, in series with its limit."""
+    corner = 3.0 + (CUTOFF_HZ - 3.0) * signal_dn / 100.0
+    corner = min(corner, CUTOFF_HZ) if approach == "abrupt" else 1 / (1 / corner + 1 / CUTOFF_HZ)
     rate = 2 * np.pi * corner * 1e-6 / np.sqrt(np.sqrt(2) - 1)
     period_us, omega = 32_000, 2 * np.pi / 32_000
     times = np.arange(0, 12 * period_us, 500)
-    found = filtered(FOLLOWING, times, np.log1p(signal_dn) + 0.01 * np.sin(omega * times))
+    found = filtered({**FOLLOWING, "approach": approach}, times, np.log1p(signal_dn) + 0.01 * np.sin(omega * times))
     late = times >= 8 * period_us
     basis = np.stack([np.sin(omega * times), np.cos(omega * times), np.ones(times.size)], axis=1)
     sine, cosine, _ = np.linalg.lstsq(basis[late], found[late], rcond=None)[0]
@@ -142,22 +145,27 @@ def test_corner_follows_the_light(signal_dn):
     assert np.arctan2(cosine, sine) == pytest.approx(-2 * np.arctan(omega / rate), abs=4e-3)
 
 
-@pytest.mark.parametrize(("rise_us", "bound"), ((1, 1e-5), (70, 3e-4), (2000, 1e-5)))
-def test_large_change_of_light_against_the_differential_equation(rise_us, bound):
+@pytest.mark.parametrize(
+    ("rise_us", "bound", "approach"),
+    ((1, 1e-5, "abrupt"), (70, 3e-4, "abrupt"), (2000, 1e-5, "abrupt"), (70, 4e-4, "gradual")),
+)
+def test_large_change_of_light_against_the_differential_equation(rise_us, bound, approach):
     """From 0.5 to 300 DN and back: z' = a(u)(u − z), y' = a(u)(z − y), a following u at every instant.
 
     The corner follows the light, is at its limit, and is near that of the dark. A jump falls between two nodes, 104 µs
     apart; the corner held at its value at a node would be wrong by 0.3. Single precision is 1e-5; where ln x changes by
-    5.3 between two nodes, the integral of the corner is a quadrature of three points.
+    5.3 between two nodes, the integral of the corner is a quadrature of three points; of a gradual one, which bends on
+    all of the way, it is a little worse.
     """
     corners_us = np.array([0, 2040, 2040 + rise_us, 12_000, 12_000 + rise_us, 60_000])
     level = np.log1p([0.5, 0.5, 300.0, 300.0, 0.5, 0.5])
     times = np.union1d(corners_us, np.r_[2500:12_000:250, 14_250:60_000:250])
-    found = filtered(FOLLOWING, times, np.interp(times, corners_us, level))
+    found = filtered({**FOLLOWING, "approach": approach}, times, np.interp(times, corners_us, level))
 
     def slope(t, state):
         u = np.interp(t, corners_us, level)
-        rate = np.minimum(0.01 + 0.99 * np.expm1(u) / 100.0, 1.0) * RATE
+        line = 0.01 + 0.99 * np.expm1(u) / 100.0
+        rate = (np.minimum(line, 1.0) if approach == "abrupt" else line / (1 + line)) * RATE
         return [rate * (u - state[0]), rate * (state[0] - state[1])]
 
     exact, state = [level[:1]], [level[0]] * 2

@@ -49,6 +49,9 @@ def on_device(values):
     return jit().Float(np.ascontiguousarray(values, dtype=np.float32).ravel())
 
 
+#: Rates of both polarities of the comparators' own noise.
+COMPARATORS = {"on_hz": 31.0, "off_hz": 47.0}
+
 # ---- previous_sample -------------------------------------------------------------------------------
 
 # Ten pairs of windows, static and moving, from the dark to bright light
@@ -193,6 +196,25 @@ def test_leak_of_previous_sample():
     assert abs(on.var() / (50 * p * (1 - p)) - 1) < 5.5 * np.sqrt(3.0 / on.size)
     # where the signal fires, the leak is not seen
     busy = model(64, evs__leak_rate_hz=900.0).without("shot", "dark_current")
+    for electrons, sign in ((4.0, -1), (25.0, 1)):
+        stage = EvsStage(busy, seed=1)
+        stage.step(flat(10.0, busy), 0)
+        assert np.all(stage.step(flat(electrons, busy), TICK_US)["polarity"] == sign)
+
+
+def test_comparator_noise_of_previous_sample():
+    """At most one event a tick: the comparison first, then leak, then the comparators' noise; z = 5.5, four times."""
+    noise = model(evs__leak_rate_hz=20.0, evs__comparator_noise=COMPARATORS).without("shot", "dark_current")
+    on, off = counts_of(EvsStage(noise, seed=1), noise, flat(10.0, noise), 50)
+    leak, own_on, own_off = -np.expm1(np.array([-0.020, -0.031, -0.047]))
+    for counts, p in ((on, leak + (1 - leak) * own_on), (off, (1 - leak) * own_off)):
+        assert abs(counts.mean() - 50 * p) < 5.5 * np.sqrt(50 * p * (1 - p) / counts.size)
+        assert abs(counts.var() / (50 * p * (1 - p)) - 1) < 5.5 * np.sqrt(3.0 / counts.size)
+    quiet = noise.without("comparator_noise", "leak")
+    assert quiet.comparator_noise_hz == (0.0, 0.0)
+    assert len(EvsStage(quiet, seed=1).step(flat(10.0, quiet), 0)) == 0
+    # where the signal fires, they are not seen
+    busy = model(64, evs__comparator_noise={"on_hz": 900.0, "off_hz": 800.0}).without("shot", "dark_current")
     for electrons, sign in ((4.0, -1), (25.0, 1)):
         stage = EvsStage(busy, seed=1)
         stage.step(flat(10.0, busy), 0)
@@ -400,6 +422,40 @@ def test_leak_of_last_event():
     assert abs(counts.mean() - mean) < 5.5 * np.sqrt(mean / counts.size)
     assert abs(counts.var() / mean - 1) < 5.5 * np.sqrt((2 + 1 / mean) / counts.size)
     assert stats.kstest(events["t_us"] / 140_000, "uniform").pvalue > 1e-6
+
+
+@pytest.mark.parametrize("dead_us", (None, 4000))
+def test_comparator_noise_of_last_event(dead_us):
+    """Poisson counts of both polarities, also over a stop; rates r/(1 + rT) behind a dead time T. z = 5.5, ten times.
+
+    Behind the dead time, the variance of a renewal count is asymptotic: no more than that of Poisson's law is asked.
+    """
+    changes = {"evs__comparator_noise": COMPARATORS, "evs__leak_rate_hz": 11.0, "evs__refractory_period_us": dead_us}
+    noise = asynchronous(128, **changes).without("dark_current")
+    stage, parts = EvsStage(noise, seed=6), []
+    for t_us in range(0, 240_001, 20_000):
+        parts.append(stage.step(flat(1.0, noise), t_us))
+        if t_us == 100_000:
+            state, stage = stage.state(), EvsStage(noise, seed=6)
+            stage.resume(state)
+    events = np.concatenate(parts)
+    events = events[events["t_us"] > 20_000]  # behind several dead times
+    pixel = events["y"].astype(int) * 128 + events["x"]
+    slower = 1 + (31 + 47 + 11) * 1e-6 * (dead_us or 0)
+    for sign, rate_hz in ((1, 31 + 11), (-1, 47)):
+        counts = np.bincount(pixel[events["polarity"] == sign], minlength=128 * 128)
+        mean = rate_hz * 0.22 / slower
+        assert abs(counts.mean() - mean) < 5.5 * np.sqrt(mean / counts.size)
+        if dead_us is None:
+            assert abs(counts.var() / mean - 1) < 5.5 * np.sqrt((2 + 1 / mean) / counts.size)
+        else:
+            assert counts.var() < mean
+    order = np.lexsort((events["t_us"], pixel))
+    within = np.diff(events["t_us"][order])[np.diff(pixel[order]) == 0]
+    assert within.min() == dead_us if dead_us else within.min() < 10
+    silent = noise.without("comparator_noise")
+    stage = EvsStage(silent, seed=6)
+    assert all(np.all(stage.step(flat(1.0, silent), t)["polarity"] == 1) for t in (0, 50_000))
 
 
 def test_noise_follows_the_current_signal():

@@ -15,6 +15,9 @@ from hesim_render.pixels.evs.stage import EvsStage
 SIGNALS = (0.0, 5.0, 33.0, 400.0)
 #: Corner over the noise's bandwidth there, at most 1: 2 Hz in the dark and 398/400 Hz more for each DN, over 100 Hz.
 SHARES = np.array([0.02, 0.06975, 0.34835, 1.0])
+#: The same where the corner comes to it gradually: line/(line + 100 Hz).
+GRADUAL = np.array([2.0, 6.975, 34.835, 400.0]) / np.array([102.0, 106.975, 134.835, 500.0])
+APPROACHES = (("abrupt", SHARES), ("gradual", GRADUAL))
 FILTERED = {
     "evs.photoreceptor_cutoff_hz": 100.0,
     "evs.photoreceptor": {
@@ -25,6 +28,10 @@ FILTERED = {
 
 def sensor(width, height, changes=()):
     return hr.load_sensor("davis346", FILTERED | dict(changes)).crop(width, height)
+
+
+def with_approach(approach):
+    return {"evs.photoreceptor": FILTERED["evs.photoreceptor"] | {"approach": approach}}
 
 
 def electrons(noise, signal_dn):
@@ -53,17 +60,17 @@ def test_a_step_of_the_noise_against_the_matrix_exponential(h):
         np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3 * abs(expected).max())
 
 
-def test_variance_and_correlation_are_those_of_each_pixels_own_corner():
-    pixel = sensor(128, 64)
-    noise = pixel.evs
+@pytest.mark.parametrize(("approach", "shares"), APPROACHES)
+def test_variance_and_correlation_are_those_of_each_pixels_own_corner(approach, shares):
+    noise = sensor(128, 64, with_approach(approach)).evs
     types, width = jit(), 128 * 64
     signal = np.repeat(SIGNALS, width // len(SIGNALS))
     log, _ = noise.log_level(types.Float(electrons(noise, signal).astype(np.float32)))
     photoreceptor = Photoreceptor(noise)
     photoreceptor.start(log, 0)
     band = BandNoise(noise, 7, photoreceptor)
-    np.testing.assert_allclose(band.share(width), np.repeat(SHARES, width // len(SIGNALS)), rtol=1e-4)
-    poles = 2 * np.pi * 100 * SHARES / np.sqrt(np.sqrt(2) - 1)
+    np.testing.assert_allclose(band.share(width), np.repeat(shares, width // len(SIGNALS)), rtol=1e-4)
+    poles = 2 * np.pi * 100 * shares / np.sqrt(np.sqrt(2) - 1)
     values = [np.array(band.start(0))]
     period_us = 1e6 / 1600
     lags, every = (1, 4, 16, 64), 0.5
@@ -85,12 +92,14 @@ def test_variance_and_correlation_are_those_of_each_pixels_own_corner():
         np.testing.assert_allclose(found, (1 + poles * tau_s) * np.exp(-poles * tau_s), atol=0.1)
 
 
-def test_the_variance_falls_with_the_corner_below_the_noises_bandwidth():
+@pytest.mark.parametrize(("approach", "shares"), APPROACHES)
+def test_the_variance_falls_with_the_corner_below_the_noises_bandwidth(approach, shares):
     apart = {"evs.contrast_threshold_on": 0.31}  # renders are as exact as the lower threshold asks for: OFF, 0.2
-    noise, plain = sensor(4, 1, apart).evs, hr.load_sensor("davis346", apart).crop(4, 1).evs
+    noise = sensor(4, 1, apart | with_approach(approach)).evs
+    plain = hr.load_sensor("davis346", apart).crop(4, 1).evs
     counted = jit().Float(electrons(noise, SIGNALS).astype(np.float32))
     ratio = np.array(noise.log_level(counted)[1]) / np.array(plain.log_level(counted)[1])
-    np.testing.assert_allclose(ratio, SHARES, rtol=1e-4)
+    np.testing.assert_allclose(ratio, shares, rtol=1e-4)
     # renders are asked for the noise that is there
     position = np.zeros(4, np.int64)
     some = electrons(noise, SIGNALS)
@@ -98,7 +107,7 @@ def test_the_variance_falls_with_the_corner_below_the_noises_bandwidth():
     theta = 0.05 * 0.2
     x = some * float(noise.table.slope[0]) + float(noise.table.base[0])
     floor = theta * x / float(noise.table.slope[0])
-    np.testing.assert_allclose(filtered, np.maximum(nominal * np.sqrt(SHARES), floor), rtol=1e-4)
+    np.testing.assert_allclose(filtered, np.maximum(nominal * np.sqrt(shares), floor), rtol=1e-4)
     assert noise.without("bandwidth").noise_share(some, position) == 1.0
 
 
@@ -132,6 +141,8 @@ def test_events_of_filtered_noise_do_not_depend_on_sampling_or_on_a_stop():
     [
         ({"evs.photoreceptor": {"cutoff_hz": 400.0, "follows_light": False, "filters_noise": True}},
          "filters_noise needs follows_light"),
+        ({"evs.photoreceptor": {"cutoff_hz": 400.0, "follows_light": False, "approach": "gradual"}},
+         "'gradual' needs follows_light"),
         ({"evs.photoreceptor_cutoff_hz": 500.0}, "above photoreceptor.cutoff_hz"),
         ({"evs.reference": "previous_sample", "evs.tick_us": 1000}, "belongs to reference 'last_event'"),
     ],

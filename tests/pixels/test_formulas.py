@@ -3,6 +3,7 @@
 The package has each formula once; the second copy is this one.
 """
 
+import itertools
 import json
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from types import SimpleNamespace
 import capture_sets
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import integrate, stats
 
 from hesim_render.calibrate import read_calibration
 from hesim_render.core.backend import jit
@@ -130,11 +131,34 @@ def test_level_and_noise_of_event_pixels(library, law):
          0.3 / np.sqrt(2 * variance / x**2))  # fmt: skip
     corner = evs.corner_hz(k, log, EVENT_BETA[0] * 800.0, 5.0, 3000.0, xp)
     same(library, corner, np.minimum(5.0 + 2995.0 * dn_per_electron * ELECTRONS / 800.0, 3000.0), atol=2e-3)
+    # in series, the line goes on beyond its largest value
+    series = evs.corner_hz(k, log, EVENT_BETA[0] * 800.0, 5.0, 3000.0, xp, 1700.0)
+    line = 5.0 + 2995.0 * dn_per_electron * ELECTRONS / 800.0
+    same(library, series, 1 / (1 / line + 1 / 1700.0), atol=2e-3)
     # with full anticorrelation s² touches 0 where the two noises are equal, and stays a variance
     opposed = evs.Coefficients.of((0.8, 3.0, 0.3, 0.11, -1.0), 1.0, "linear", NUMPY)
     touching = 0.11 / 0.3 + np.linspace(-1e-7, 1e-7, 999)
     assert np.min((opposed.light * touching + opposed.cross) * touching + opposed.dark) < 0  # by rounding
     assert np.all(on_host(evs.voltage_variance(opposed, library.take(touching), xp)) >= 0)
+
+
+@pytest.mark.parametrize(("first_s", "second_s"), ((0.31, 0.07), (0.002, 1.7)))
+def test_two_equal_poles_have_the_variance_and_the_delay_of_unequal_ones(first_s, second_s):
+    """White noise behind 1/((1 + iωτ₁)(1 + iωτ₂)), and the mean time of its impulse response, by quadrature."""
+
+    def both(one, two):
+        power = integrate.quad(lambda w: 1 / ((1 + (w * one) ** 2) * (1 + (w * two) ** 2)), 0, np.inf, limit=500)[0]
+        if one == two:
+            response = lambda t: t / one**2 * np.exp(-t / one)  # noqa: E731
+        else:
+            response = lambda t: (np.exp(-t / one) - np.exp(-t / two)) / (one - two)  # noqa: E731
+        ends = np.array([0, min(one, two), 5 * min(one, two), max(one, two), 60 * max(one, two)])
+        delay = sum(integrate.quad(lambda t: t * response(t), *pair, limit=500)[0] for pair in itertools.pairwise(ends))
+        return power, delay
+
+    # corners in series: two equal poles of twice the corner in which one pole of τ has its own
+    corner = evs.in_series(1 / first_s, 1 / second_s)
+    np.testing.assert_allclose(both(1 / (2 * corner), 1 / (2 * corner)), both(first_s, second_s), rtol=1e-6)
 
 
 def test_event_probabilities_against_the_normal_law():

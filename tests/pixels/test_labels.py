@@ -115,6 +115,9 @@ def test_leak_and_hot_pixels_are_told_apart_from_noise():
         noise = model(asynchronous, quiet, evs__leak_rate_hz=3.0)
         events, found = run(noise, TICKS, lambda t: still)
         assert events.size > 300 and (found.label == Label.LEAK).all() and found.clean.size == 0
+        noise = model(asynchronous, quiet, evs__comparator_noise={"on_hz": 1.0, "off_hz": 2.5})
+        events, found = run(noise, TICKS, lambda t: still)
+        assert events.size > 300 and (found.label == Label.NOISE).all() and found.clean.size == 0
         noise = model(asynchronous, quiet, **hot)
         events, found = run(noise, TICKS, lambda t: still)
         assert events.size > 300 and (found.label == Label.HOT).all()
@@ -126,10 +129,12 @@ def test_leak_and_hot_pixels_are_told_apart_from_noise():
 
 def test_with_a_dead_time_leak_and_hot_events_keep_their_origin():
     noise = model(True, {**NOISY, "beta4": 0.0}, evs__leak_rate_hz=3.0, evs__refractory_period_us=500,
+                  evs__comparator_noise={"off_hz": 2.5},
                   **{"evs.defects": {"hot_share": 0.02, "hot_rate_hz": 200.0}})  # fmt: skip
     events, found = run(noise, TICKS, lambda t: np.full(SIZE, np.log(101.0)))
     of_hot = np.isin(events["y"].astype(int) * COLS + events["x"], noise.defects.place)
-    assert (found.label[~of_hot] == Label.LEAK).all() and (~of_hot).sum() > 300
+    on, off = (found.label[~of_hot & (events["polarity"] == sign)] for sign in (1, -1))
+    assert (on == Label.LEAK).all() and on.size > 300 and (off == Label.NOISE).all() and off.size > 200
     assert (found.label[of_hot] == Label.HOT).mean() > 0.9
 
 

@@ -29,6 +29,7 @@ class Camera:
     late_us: float = 0.0  # longer exposure than stated
     light_scatter: float = 0.0  # relative, from frame to frame
     correlation: float = 0.0  # of the read noise of neighbours in a row
+    full_well: float = np.inf  # e-
     hum: float = 0.0  # DN, of a checkerboard with a new phase in each frame
     exposures_us: tuple[float, ...] = tuple(float(t) for t in np.linspace(400, 24_000, 18).round())
     long_us: float = 11_400.0
@@ -56,7 +57,7 @@ class Camera:
                 light = self.efficiency * photons_per_us * (exposure_us + self.late_us) * response
                 light = light * (1 + self.light_scatter * rng.standard_normal())
             electrons = rng.poisson(light + self.dark_current * exposure_us * 1e-6 + np.zeros(shape))
-            signal = self.gain * electrons
+            signal = self.gain * np.minimum(electrons, self.full_well)
             signal = signal * (1 + self.bend * signal / (2**self.bits - 1))
             noise = rng.standard_normal((self.rows, self.cols + 1))
             root = np.sqrt(1 - 4 * self.correlation**2)

@@ -191,7 +191,9 @@ def _dark_current(result: PairCalibration, k: float, relative: float) -> dict[st
 
 
 def _full_well(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
-    """Electrons at the largest variance; between two levels its place is not known better than their distance."""
+    """Electrons at the largest variance, and where the signal may end: beyond the level below, and before the one above
+    the last whose variance is as large but for its error, or the brightest signal, or the end of the ADC's range.
+    """
     if result.saturation >= result.signal.size:
         return not_identifiable(
             f"no level saturates: it is at least {result.signal.max() / k:.0f} e-; capture more light"
@@ -199,11 +201,19 @@ def _full_well(result: PairCalibration, k: float, relative: float) -> dict[str, 
     here = result.saturation
     light = result.light
     electrons = result.responsivity.slope * light[here] / k
-    step = float(light[min(here + 1, light.size - 1)] - light[here - 1]) / 2
-    error = electrons * float(np.hypot(relative, step / np.sqrt(3) / light[here]))
-    above = result.lit.high[here:].max()
-    return estimated(float(electrons), error, "e-") | {
-        "limited_by": "ADC full scale" if above > 0.01 else "full well", "photons": float(light[here]),
+    whole = result.lit.variance + np.maximum(result.lit.row, 0.0)
+    near = whole >= whole[here] - Z_95 * np.hypot(result.lit.error, result.lit.error[here])
+    last = here + int(np.argmin(np.append(near[here:], False))) - 1
+    per_photon = result.responsivity.slope / k
+    ends = per_photon * np.array([light[here - 1], light[min(last + 1, light.size - 1)]])
+    adc = result.lit.high[here:].max() > 0.01
+    # the brightest level may be cut off as a whole: its mean is then the end itself
+    most = result.pairs.spec.full_scale_dn - result.black.value if adc else result.signal.max()
+    ends[1] = max(ends[1], most / k)
+    low, high = ends * (1 + Z_95 * relative * np.array([-1, 1]))
+    return estimated(float(electrons), float(high - low) / (2 * Z_95), "e-") | {
+        "interval_95": [float(low), float(high)], "limited_by": "ADC full scale" if adc else "full well",
+        "photons": float(light[here]),
     }  # fmt: skip
 
 

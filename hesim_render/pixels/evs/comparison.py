@@ -18,7 +18,7 @@ from hesim_render.pixels.evs.formulas import leak_probability
 from hesim_render.pixels.evs.leak_drift import LeakDrift
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.photoreceptor import Photoreceptor
-from hesim_render.pixels.evs.processes import BandNoise, LeakProcess
+from hesim_render.pixels.evs.processes import BandNoise, RandomEvents
 from hesim_render.pixels.evs.refractory import LONG_AGO_US, Refractory
 from hesim_render.pixels.evs.start import start_chances, start_of
 
@@ -38,6 +38,14 @@ def _events(t_us: ArrayLike, pixel: NDArray[np.integer], polarity: ArrayLike, co
 def _nodes_us(t_us: int, *parts: BandNoise | Photoreceptor | None) -> list[float]:
     """Ends of the segments up to the sample at `t_us`, in each of which the level goes on a straight line."""
     return [*sorted(set().union(*(part.nodes_us(t_us) for part in parts if part))), float(t_us)]
+
+
+#: Processes of events at random times: the polarity times the `Origin` of their events, and their random numbers.
+_RANDOM = {
+    int(Origin.LEAK): Stream.EVS_LEAK,
+    int(Origin.COMPARATOR_NOISE): Stream.COMPARATOR_ON,
+    -int(Origin.COMPARATOR_NOISE): Stream.COMPARATOR_OFF,
+}
 
 
 class PreviousSample:
@@ -61,7 +69,8 @@ class PreviousSample:
         level, variance = self._noise.log_level(electrons)
         if self._photoreceptor:
             level = self._photoreceptor.follow(level, t_us)
-        # four random words for each pixel and sample: two for the noise, one for a leak event
+        # four random words for each pixel and sample: two for the noise, one for a leak event, one for the comparators'
+        # own noise
         word = philox(self._seed, Stream.EVS, self._noise.on_device.key, t_us).next_uint32x4()
         deviate = normal_pair(word[0], word[1])[0]
         if not self._independent:
@@ -82,6 +91,12 @@ class PreviousSample:
             # a whole number of 2³² as the bound, opaque so that no rate is written into the kernel
             leaks = word[2] < dr.opaque(types.UInt32, min(round(probability * 2**32), 2**32 - 1))
             polarity = dr.select(~on & ~off & leaks, types.Int8(Origin.LEAK), polarity)
+        if self._noise.resets_hz > self._noise.leak_rate_hz:
+            # ON events of the comparators' noise take the lowest numbers of a random word, OFF events the highest
+            chances = [leak_probability(hz, (t_us - self._t_us) * S_PER_US) for hz in self._noise.comparator_noise_hz]
+            below, above = (dr.opaque(types.UInt32, min(round(p * 2**32), 2**32 - 1)) for p in chances)
+            own = dr.select(word[3] < below, types.Int8(1), dr.select(~word[3] < above, types.Int8(-1), types.Int8(0)))
+            polarity = dr.select(polarity == 0, own * types.Int8(Origin.COMPARATOR_NOISE), polarity)
         begin_us = self._t_us
         dr.schedule(polarity)
         self._keep(level, variance, t_us)
@@ -106,7 +121,7 @@ class LastEvent:
 
     STATE: tuple[str, ...] = (
         *("_t_us", "_log", "_spread", "level", "reference"),
-        *("_band_noise", "_photoreceptor", "_refractory", "_leak", "_drift"),
+        *("_band_noise", "_photoreceptor", "_refractory", "_leak", "_own_on", "_own_off", "_drift"),
     )
 
     def __init__(self, noise: EvsNoise, seed: int, defects: DefectEvents | None, is_reset: bool) -> None:
@@ -124,7 +139,16 @@ class LastEvent:
         self._refractory: Refractory | None = None
         if noise.refractory_period_us is not None:
             self._refractory = Refractory(noise.refractory_period_us, self._pixels)
-        self._leak = LeakProcess(noise, seed) if noise.leak_rate_hz > 0 else None
+        self._leak, self._own_on, self._own_off = (
+            RandomEvents(noise.on_device.key, seed, stream, rate_hz) if rate_hz > 0 else None
+            for stream, rate_hz in zip(_RANDOM.values(), (noise.leak_rate_hz, *noise.comparator_noise_hz), strict=True)
+        )
+        #: Events at random times, by the polarity times the `Origin` of each.
+        self._random = {
+            origin: process
+            for origin, process in zip(_RANDOM, (self._leak, self._own_on, self._own_off), strict=True)
+            if process
+        }
         self._drift = LeakDrift(noise) if noise.leak_drift is not None else None
 
     def of_pixel(self, level: Float) -> Float:
@@ -156,8 +180,8 @@ class LastEvent:
         start = self._photoreceptor.start(log, self._t_us) if self._photoreceptor else log
         self.level = start + (spread * self._band_noise.start(self._t_us) if self._band_noise else 0.0)
         self.reference = dr.copy(self.level)
-        if self._leak:
-            self._leak.start(self._t_us)
+        for process in self._random.values():
+            process.start(self._t_us)
         self._log, self._spread = log, spread
         events_hz, chance = np.zeros(self._pixels), None
         if self._band_noise and settles:
@@ -202,9 +226,12 @@ class LastEvent:
                 level = level + self._drift.at(electrons, elapsed_us / (t_us - self._t_us), elapsed_us)
             parts.append(self._crossings(level, begin_us, end_us))
             begin_us = end_us
-        if self._leak and not self._refractory:
-            for due_us, pixel in self._leak.until(t_us):
-                parts.append(_events(self._stamp(due_us), pixel, Origin.LEAK, self._cols))
+        beside: list[NDArray[np.void]] = []  # events that leave the reference as it is, which the drift must not count
+        if not self._refractory:
+            for origin, process in self._random.items():
+                into = beside if self._drift else parts
+                for due_us, pixel in process.until(t_us):
+                    into.append(_events(self._stamp(due_us), pixel, origin, self._cols))
         if self._defects and not self._refractory:
             own_us, pixel, polarity = self._defects.between(self._t_us, t_us)
             parts.append(_events(self._stamp(own_us), pixel, polarity * Origin.DEFECT, self._cols))
@@ -215,6 +242,7 @@ class LastEvent:
             lower = jit().Float(self._drift.pass_by(events, self._cols, electrons, self._t_us, t_us))
             self.level, self.reference = self.level - lower, self.reference - lower
             dr.eval(self.level, self.reference)
+        events = np.concatenate([events, *beside])
         self._t_us, self._log, self._spread = t_us, log, spread
         if self._defects:
             events = self._defects.alive(events, self._cols)
@@ -273,8 +301,12 @@ class LastEvent:
         level : level at the end of the segment, one value per pixel.
         begin_us, end_us : bounds of the segment, µs.
         """
-        due = [(np.empty(0), np.empty(0, np.uint32)), *(self._leak.until(end_us) if self._leak else ())]
-        origins = [np.full(len(part[0]), Origin.LEAK, np.float64) for part in due]
+        due = [(np.empty(0), np.empty(0, np.uint32))]
+        origins = [np.empty(0)]
+        for origin, process in self._random.items():
+            for part in process.until(end_us):
+                due.append(part)
+                origins.append(np.full(len(part[0]), origin, np.float64))
         if self._defects:  # of asynchronous sensors they are ON events, as those of leak
             due.append(self._defects.between(begin_us, end_us)[:2])
             origins.append(np.full(len(due[-1][0]), Origin.DEFECT, np.float64))

@@ -25,6 +25,7 @@ class Origin(IntEnum):
     LEAK = 2
     DEFECT = 3
     DRIFT = 4  # of the comparator, but at least half of it from the drift of the leak
+    COMPARATOR_NOISE = 5
 
 
 def no_events() -> NDArray:

@@ -145,13 +145,28 @@ def corner_line(part: Values, least_hz: float, largest_hz: float) -> Values:
     return least_hz + (largest_hz - least_hz) * part
 
 
+def in_series(first_hz: Values, second_hz: Values) -> Values:
+    """Corner of two stages whose time constants add up, f₁f₂/(f₁ + f₂)."""
+    return first_hz * second_hz / (first_hz + second_hz)
+
+
 def corner_hz(
-    k: Coefficients, log: Values, reference_level: Values, least_hz: float, largest_hz: float, xp: Namespace
+    k: Coefficients,
+    log: Values,
+    reference_level: Values,
+    least_hz: float,
+    largest_hz: float,
+    xp: Namespace,
+    series_hz: float | None = None,
 ) -> Values:
     """Corner frequency of a photoreceptor that follows the light: a straight line from the dark to a largest value.
 
     The corner is proportional to the photocurrent, of which the dark current is a part. White noise before the
     photoreceptor has a variance behind it that is proportional to the corner.
+
+    Two poles of the time constants τ₁, τ₂ leave white noise of the spectral density S (two-sided) the variance
+    S/(2 (τ₁ + τ₂)), and delay a step by τ₁ + τ₂ on average [elmore1948]. Two equal poles of the mean time constant
+    do both as well: so light and bias go on as one corner, in series.
 
     Parameters
     ----------
@@ -161,12 +176,16 @@ def corner_hz(
     least_hz : corner in the dark, Hz.
     largest_hz : corner that the bias current sets, Hz.
     xp : functions of the arrays' library.
+    series_hz : corner of the bias current, in series with that of the light, whose line goes on beyond `largest_hz`;
+        None: the line ends there.
 
     Returns
     -------
     Corner frequency, Hz.
     """
     line = corner_line((xp.exp(log) - k.base) / reference_level, least_hz, largest_hz)
+    if series_hz is not None:
+        return in_series(xp.maximum(line, least_hz), series_hz)
     return xp.clip(line, least_hz, largest_hz)  # the lower limit is for rounding: no light is below 0
 
 

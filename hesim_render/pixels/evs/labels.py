@@ -27,7 +27,7 @@ from hesim_render.pixels.evs.stage import EvsStage
 
 #: Terms that the noise-free stream lacks; the spread of thresholds besides in the nominal ones.
 _NOISE = (
-    *("shot", "dark_current", "leak", "refractory", "readout_limit"),
+    *("shot", "dark_current", "leak", "comparator_noise", "refractory", "readout_limit"),
     *("stuck", "hot", "flickering"),
 )
 
@@ -86,7 +86,7 @@ class Labeller:
         number = np.where(counted, before + np.cumsum(counted) - 1, -1)
         self._events += int(np.count_nonzero(counted))
         # first by what made it; then by whether pixels without noise give it as well
-        result = np.choose(origin - 1, [Label.NOISE, Label.LEAK, Label.HOT, Label.LEAK]).astype(np.uint8)
+        result = np.choose(origin - 1, [Label.NOISE, Label.LEAK, Label.HOT, Label.LEAK, Label.NOISE]).astype(np.uint8)
         step = StepLabels(no_events(), np.empty(0, np.int64), np.empty(0, np.uint8))
         if self._partners is not None:
             step = self._partners.take(stage, electrons, events, origin, number)

@@ -33,7 +33,7 @@ from hesim_render.specs.event_pixels import EvsCoefficients, EvsSpec, LeakSpec, 
 _DEFECTS = ("stuck", "hot", "flickering")
 EVS_TERMS = (
     *("shot", "dark_current", "mismatch", "leak", "bandwidth", "refractory", "readout_limit", "crosstalk"),
-    *_DEFECTS,
+    *("comparator_noise", *_DEFECTS),
 )
 
 #: Least noise with which deviations of the clean signal are compared, in thresholds.
@@ -69,7 +69,8 @@ class EvsNoise(PlainState):
         ``shot`` is β3, ``dark_current`` is β4 (its shot noise), ``mismatch`` the spread of thresholds,
         ``leak`` the leak, ``bandwidth`` the photoreceptor's low-pass, ``refractory`` the dead time after
         an event, ``readout_limit`` the loss of events in the read-out, ``crosstalk`` the light from neighbouring
-        pixels, ``stuck``, ``hot`` and ``flickering`` the defects of pixels.
+        pixels, ``comparator_noise`` the events of the comparators' own noise, ``stuck``, ``hot`` and ``flickering``
+        the defects of pixels.
 
         Raises
         ------
@@ -94,6 +95,17 @@ class EvsNoise(PlainState):
         """The leak where it is a drift of the reference, else None."""
         leak = self.spec.leak
         return leak if leak is not None and leak.process == "drift" and "leak" not in self.off else None
+
+    @property
+    def comparator_noise_hz(self) -> tuple[float, float]:
+        """Rates of the ON and of the OFF events of the comparators' own noise."""
+        own = self.spec.comparator_noise
+        return (0.0, 0.0) if own is None or "comparator_noise" in self.off else (own.on_hz, own.off_hz)
+
+    @property
+    def resets_hz(self) -> float:
+        """Rate of the events that come at random times, whatever the level: each resets a pixel with a dead time."""
+        return self.leak_rate_hz + sum(self.comparator_noise_hz)
 
     @cached_property
     def defects(self) -> PixelDefects:
@@ -124,8 +136,7 @@ class EvsNoise(PlainState):
     @property
     def readout_buffer_events(self) -> int:
         """Events that can wait for a limited read-out: from the file, else what it reads in a tick or in 1 ms."""
-        spec = self.spec
-        if spec.readout_buffer_events is not None:
+        if (spec := self.spec).readout_buffer_events is not None:
             return spec.readout_buffer_events
         assert spec.readout_max_events_per_s is not None
         return max(1, round(spec.readout_max_events_per_s * (spec.tick_us or 1000) * S_PER_US))
@@ -133,8 +144,7 @@ class EvsNoise(PlainState):
     @property
     def is_noiseless(self) -> bool:
         """True where ln x has no temporal noise at any signal."""
-        table = self.table
-        return not (np.any(table.light) or np.any(table.dark))
+        return not (np.any(self.table.light) or np.any(self.table.dark))
 
     # ---- per-position coefficients and per-pixel thresholds -----------------------------------------
 
@@ -209,14 +219,15 @@ class EvsNoise(PlainState):
             return 1.0
         bandwidth_hz = self.spec.photoreceptor_cutoff_hz
         assert bandwidth_hz is not None
-        return np.minimum(self.corner_hz(electrons, position) / bandwidth_hz, 1.0)
+        return np.minimum(self.corner_hz(electrons, position, bandwidth_hz) / bandwidth_hz, 1.0)
 
-    def corner_hz(self, electrons: NDArray, position: NDArray[np.integer] | int) -> NDArray:
+    def corner_hz(self, electrons: NDArray, position: NDArray[np.integer] | int, limit_hz: float = 0.0) -> NDArray:
         """Corner of a photoreceptor that follows the light, Hz.
 
         Parameters
         ----------
         electrons, position : as for `noise_share`.
+        limit_hz : limit of a gradual approach; 0: that of the signal, `cutoff_hz`.
         """
         spec, level = self.photoreceptor, self._reference_level
         assert spec is not None and spec.min_cutoff_hz is not None and level is not None
@@ -224,7 +235,7 @@ class EvsNoise(PlainState):
         k = self.table.each(lambda values: values.astype(kind)[position])
         log = np.log(formulas.voltage(k, np.maximum(electrons, kind.type(0))))
         limits_hz = spec.min_cutoff_hz, spec.cutoff_hz
-        return formulas.corner_hz(k, log, level.astype(kind)[position], *limits_hz, NUMPY)
+        return formulas.corner_hz(k, log, level.astype(kind)[position], *limits_hz, NUMPY, spec.series_hz(limit_hz))
 
     # ---- the model ----------------------------------------------------------------------------------
 

@@ -61,14 +61,16 @@ class EventPixels:
         xp = device_namespace()
         log, variance = formulas.log_level(self._coefficients, electrons, self._law, xp)
         if self._noise_filter is not None:
-            variance *= xp.minimum(self.corner_hz(log, self._noise_filter) / self._bandwidth_hz, 1.0)
+            corner_hz = self.corner_hz(log, self._noise_filter, self._bandwidth_hz or 0.0)
+            variance *= xp.minimum(corner_hz / self._bandwidth_hz, 1.0)
         return log, variance
 
-    def corner_hz(self, log: Float, spec: PhotoreceptorSpec) -> Float:
-        """Corner of each pixel's photoreceptor at ln x, Hz."""
+    def corner_hz(self, log: Float, spec: PhotoreceptorSpec, limit_hz: float = 0.0) -> Float:
+        """Corner of each pixel's photoreceptor at ln x, Hz; `limit_hz` as for `EvsNoise.corner_hz`."""
         assert spec.min_cutoff_hz is not None
         limits = spec.min_cutoff_hz, spec.cutoff_hz
-        return formulas.corner_hz(self._coefficients, log, self._reference_level, *limits, device_namespace())
+        pixels = self._coefficients, log, self._reference_level
+        return formulas.corner_hz(*pixels, *limits, device_namespace(), spec.series_hz(limit_hz))
 
     @property
     def log_of_largest_corner(self) -> Float:

@@ -71,6 +71,14 @@ class Photoreceptor:
         """a of both poles in the present light, 1/µs: a number, or one per pixel."""
         return self._rate_at(self._input) if self._spec.follows_light else _rate(self._spec.cutoff_hz)
 
+    @property
+    def noise_rate_per_us(self) -> Float:
+        """The same for the noise, of which photoreceptor_cutoff_hz is the limit, where the corner comes to it
+        gradually.
+        """
+        bandwidth_hz = self._noise.spec.photoreceptor_cutoff_hz or 0.0
+        return _rate(self._noise.on_device.corner_hz(self._input, self._spec, bandwidth_hz))
+
     def _node_at(self, t_us: float) -> int:
         return math.floor(t_us / self._period_us + 1e-6)  # reached, but for rounding
 
@@ -138,12 +146,14 @@ class Photoreceptor:
         """State at the end of a line, with the corner of the light at each instant of it.
 
         The line has up to two parts: one in which the corner follows the light, and before or after it one in which
-        the corner is the largest.
+        the corner is the largest. Where the corner comes to its limit gradually, it follows the light everywhere.
         """
         import drjit as dr
 
         types = jit()
         begin, elapsed = self._input, dr.opaque(types.Float, elapsed_us)
+        if self._spec.approach == "gradual":
+            return self._follow_inside(self._state, begin, change, elapsed)
         # the largest corner, and the part of the line, 0 to 1, after which the light reaches it
         largest = dr.opaque(types.Float, _rate(self._spec.cutoff_hz))
         line = dr.select(change == 0, types.Float(1e-30), change)

@@ -135,7 +135,7 @@ class BandNoise:
         import drjit as dr
 
         assert self._photoreceptor is not None
-        return dr.minimum(self._photoreceptor.rate_per_us * self._period_us, self._largest)
+        return dr.minimum(self._photoreceptor.noise_rate_per_us * self._period_us, self._largest)
 
     def _scale(self) -> Float:
         """Amplitude that compensates the interpolation, for each pixel's own rate."""
@@ -176,15 +176,23 @@ def _step(value: Float, speed: Float, h: Float, z: tuple[Float, Float]) -> tuple
     )
 
 
-class LeakProcess:
-    """Leak events. The waiting times of each pixel are exponentially distributed."""
+class RandomEvents:
+    """Events at random times: of the leak, or of the comparators' noise. The waiting times of each pixel are
+    exponentially distributed.
+
+    Parameters
+    ----------
+    key : full-sensor index of each pixel.
+    seed : seed of the events.
+    stream : purpose of the random numbers.
+    rate_hz : events of a pixel.
+    """
 
     STATE = ("_due_us", "_count")
 
-    def __init__(self, noise: EvsNoise, seed: int) -> None:
-        self._key = noise.on_device.key
-        self._stream_key = stream_key(seed, Stream.EVS_LEAK)
-        self._mean_us = US_PER_S / noise.leak_rate_hz
+    def __init__(self, key: UInt32, seed: int, stream: Stream, rate_hz: float) -> None:
+        self._key, self._stream_key = key, stream_key(seed, stream)
+        self._mean_us = US_PER_S / rate_hz
         self._due_us: Float64 = None
         self._count: UInt32 = None  # events so far
 

@@ -225,7 +225,7 @@ def start_of(
     bandwidth_hz, period_us = noise.spec.photoreceptor_cutoff_hz, noise.refractory_period_us
     assert bandwidth_hz is not None
     dead_s = (period_us or 0) / US_PER_S
-    resets_hz = 1 / _LONG_S + (noise.leak_rate_hz if period_us else 0.0)
+    resets_hz = 1 / _LONG_S + (noise.resets_hz if period_us else 0.0)
     octaves = np.unique(np.concatenate([whole, whole[octave > whole] + 1]))
     for step in octaves:
         here = np.flatnonzero(np.abs(octave - step) < 1)
