@@ -298,6 +298,10 @@ def test_the_share_of_a_pixel_and_a_window_beside_a_moving_line():
     """The mean of the share at rest over 4000 times, by the rule of the middle, and that of half a million points."""
     rng = np.random.default_rng(8)
     x, y, offset, speed = planes(rng, 80)
+    # almost along a side of the pixel, and almost at rest
+    angle = np.array([0.004, np.pi / 2 - 0.003, np.pi + 0.006, 0.7, 0.005])
+    x, y = np.r_[x, np.cos(angle)], np.r_[y, np.sin(angle)]
+    offset, speed = np.r_[offset, 0.493, -0.48, 0.2, 0.11, 0.503], np.r_[speed, 0.71, -0.004, 2.3, 0.003, 0.006]
     share = moving_share(x, y, offset, speed)
     times = (np.arange(4000) + 0.5) / 4000 - 0.5
     mean = [halfplane_share(np.full(4000, a), np.full(4000, b), c + v * times).mean()
