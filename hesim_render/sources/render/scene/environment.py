@@ -11,7 +11,7 @@ from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading
 from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
-from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, transform
+from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, files_readable, transform
 from hesim_render.sources.render.scene.sizes import require_fits
 from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.light import LightSpec
@@ -47,7 +47,7 @@ def environment(mi: MitsubaModule, light: LightSpec, normal: NDArray[np.float64]
         raise SpecError("environment maps of scene files are rendered in vectorised variants of Mitsuba only", key=key)
     file = light.folder / str(light.file)
     require_fits(file)
-    with as_spec_error(file, f"{key}.file"), reading(file, "as a picture"):
+    with as_spec_error(file, f"{key}.file"), reading(file, "as a picture"), files_readable():
         picture = mi.Bitmap(str(file)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
     values = np.array(picture, dtype=np.float32)
     if not np.isfinite(values).all() or values.min() < 0 or min(values.shape[:2]) < 2:
