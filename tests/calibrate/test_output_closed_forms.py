@@ -19,13 +19,21 @@ Z = 1.959964
 K, RELATIVE = 0.37, 0.021
 
 
+def lit_pairs(**changed):
+    """Variances of pairs in the light, DN², and the part of pixels at the end of the ADC's range."""
+    given = {"variance": [2.3, 6.1, 19.0, 18.9], "row": [0.1, 0.2, 0.3, -0.4], "error": [0.2, 0.3, 0.5, 0.6],
+             "high": [0.0, 0.0, 0.004, 0.2]}  # fmt: skip
+    return SimpleNamespace(**{name: np.array(values) for name, values in {**given, **changed}.items()})
+
+
 def calibration(**changed):
     """A calibration of EMVA 1288 captures with unlike numbers everywhere."""
     spatial_dark = SpatialVariance(0.31, 0.12, 1.7, (0.011, 0.017, 0.13), (13, 21, 273))
     spatial_lit = SpatialVariance(0.9, 2.4, 6.1, (0.05, 0.07, 0.9), (13, 21, 273))
     mean = np.full((14, 22), 40.0)
     given = {
-        "pairs": SimpleNamespace(has_photons=True, shape=(14, 22), is_dark_once=False, long=[0]),
+        "pairs": SimpleNamespace(has_photons=True, shape=(14, 22), is_dark_once=False, long=[0],
+                                 spec=SimpleNamespace(full_scale_dn=255)),
         "dark_noise_is_rounded_off": False,
         "gain": SimpleNamespace(slope=K, error=K * RELATIVE, groups=9),
         "responsivity": SimpleNamespace(slope=0.22, error=0.0031, groups=9),
@@ -33,7 +41,7 @@ def calibration(**changed):
         "black": SimpleNamespace(value=40.0, slope=17.0, slope_error=0.7, groups=5, rms=0.002),
         "lines_dn2": 0.7, "row": (0.62, 0.05), "col": (0.04, 0.03),
         "light": np.array([100.0, 300.0, 900.0, 1500.0]), "saturation": 2, "signal": np.array([22.0, 66, 190, 200]),
-        "clear": np.array([1, 1, 0, 0], bool), "lit": SimpleNamespace(high=np.array([0.0, 0.0, 0.004, 0.2])),
+        "clear": np.array([1, 1, 0, 0], bool), "lit": lit_pairs(),
         "long_dark": SimpleNamespace(spatial=spatial_dark, mean=mean),
         "long_lit": SimpleNamespace(spatial=spatial_lit, mean=mean + 120),
         "linearity": (np.array([1, 0, 1, 1], bool), np.array([-0.4, 0.1, 0.9])),
@@ -74,17 +82,31 @@ def test_efficiency_dark_current_and_full_well_of_emva_captures():
     found = pairs_output._dark_current(calibration(), K, RELATIVE)
     check(found, 17 / K, np.hypot(0.7 / K, 17 / K * RELATIVE), "e-/s", 2.776445)  # 4 degrees
     assert found["from_variance"] == pytest.approx(61 / K**2) and found["value_dn_per_s"] == 17
-    # half of the distance of the levels around is a rectangular law's width: divided by √3
-    found = pairs_output._full_well(calibration(), K, RELATIVE)
-    electrons = 0.22 * 900 / K
-    check(found, electrons, electrons * np.hypot(RELATIVE, (1500 - 300) / 2 / np.sqrt(3) / 900), "e-", Z)
+    per_photon = 0.22 / K
+
+    def full_well(saturation=2, full_scale_dn=255, **lit):
+        given = calibration(saturation=saturation, lit=lit_pairs(**lit))
+        given.pairs.spec.full_scale_dn = full_scale_dn
+        return pairs_output._full_well(given, K, RELATIVE)
+
+    # from the level below to the one above the last as large: the last but one is as large as the largest but for its error
+    found = full_well()
+    ends = per_photon * 300 * (1 - Z * RELATIVE), per_photon * 1500 * (1 + Z * RELATIVE)
+    assert found["value"] == pytest.approx(per_photon * 900) and found["interval_95"] == pytest.approx(ends)
+    assert found["standard_error"] == pytest.approx((ends[1] - ends[0]) / (2 * Z))
     assert found["limited_by"] == "ADC full scale" and found["photons"] == 900
-    high = SimpleNamespace(high=np.array([0.5, 0.5, 0.01, 0.009]))
-    assert pairs_output._full_well(calibration(lit=high), K, RELATIVE)["limited_by"] == "full well"
-    last = pairs_output._full_well(calibration(saturation=3), K, RELATIVE)
-    assert last["standard_error"] / last["value"] == pytest.approx(
-        np.hypot(RELATIVE, (1500 - 900) / 2 / np.sqrt(3) / 1500)
-    )
+    # the variance falls behind the largest, but the signal goes on to 200 DN, or to the end of the ADC's range
+    few = {"high": [0.5, 0.5, 0.01, 0.009]}
+    found = full_well(1, variance=[2.3, 19.0, 6.1, 18.9], **few)
+    assert found["limited_by"] == "ADC full scale"
+    found = full_well(1, variance=[2.3, 19.0, 6.1, 18.9], high=[0.5, 0.01, 0.01, 0.009])
+    assert found["limited_by"] == "full well"
+    assert found["interval_95"] == pytest.approx([per_photon * 100 * (1 - Z * RELATIVE), 200 / K * (1 + Z * RELATIVE)])
+    found = full_well(1, variance=[2.3, 19.0, 18.4, 6.1], full_scale_dn=300)
+    assert found["interval_95"][1] == pytest.approx(per_photon * 1500 * (1 + Z * RELATIVE))
+    found = full_well(1, variance=[2.3, 19.0, 17.0, 18.9], row=[0, 0, 0, 0], full_scale_dn=100)
+    assert found["interval_95"][1] == pytest.approx(per_photon * 900 * (1 + Z * RELATIVE))
+    assert full_well(full_scale_dn=1023)["interval_95"][1] == pytest.approx((1023 - 40) / K * (1 + Z * RELATIVE))
     none = pairs_output._full_well(calibration(saturation=4), K, RELATIVE)
     assert none["value"] is None and f"at least {200 / K:.0f} e-" in none["reason"]
 

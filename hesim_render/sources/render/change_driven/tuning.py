@@ -158,7 +158,7 @@ class Tuning:
     moving_contrast_rays: float = 0.5
     flat_contrast: float = 4.0
     low_contrast: float = 16.0
-    flat_part: float = 1 / 16
+    flat_part: float = 1 / 8
     least_difference_rays: int = 64
     difference_gain: float = 4.0
     difference_part: float = 0.5
