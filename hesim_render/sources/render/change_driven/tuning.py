@@ -142,7 +142,7 @@ class Tuning:
     extreme_change: float = 128.0
     extreme_windows: int = 1
     least_rays: int = 8
-    ray_weight: float = 1.0
+    ray_weight: float = 2.0
     most_rays: int = 4096
     diffuse_gain: tuple[float, float] = (0.68, 0.70)
     path_gain: tuple[float, float] = (0.46, 0.56)
