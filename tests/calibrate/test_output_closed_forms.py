@@ -89,7 +89,7 @@ def test_efficiency_dark_current_and_full_well_of_emva_captures():
         given.pairs.spec.full_scale_dn = full_scale_dn
         return pairs_output._full_well(given, K, RELATIVE)
 
-    # from the level below to the one above the last as large: the last but one is as large as the largest but for its error
+    # from the level below to the one above the last that is as large but for its error
     found = full_well()
     ends = per_photon * 300 * (1 - Z * RELATIVE), per_photon * 1500 * (1 + Z * RELATIVE)
     assert found["value"] == pytest.approx(per_photon * 900) and found["interval_95"] == pytest.approx(ends)

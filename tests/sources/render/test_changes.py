@@ -143,8 +143,8 @@ def test_the_estimate_of_less_scatter_is_taken_but_hidden_light_is_added_up():
 
 
 def test_knowledge_of_an_edge_leaves_the_rays_for_what_stays_unseen():
-    """Light hidden from all pilot rays: (4.5 − 1.5)/(2 · 0.5 · 0.03) = 100 rays bring two wanted errors each; and as many as
-    a closer look had.
+    """Light hidden from all pilot rays: (4.5 − 1.5)/(2 · 0.5 · 0.03) = 100 rays bring two wanted errors each; and as
+    many as a closer look had.
     """
     hidden, flux = np.full(9, 1.5), np.full(9, 1.5)
     hidden[3] = 4.5

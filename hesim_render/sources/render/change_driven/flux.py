@@ -243,6 +243,10 @@ class ChangeDrivenFlux:
         renderer.counts, self._tracer.rays_done = counts, done
         return rays / pixel.size
 
+    def is_apart(self, role: Role) -> bool:
+        """True if pixels of a role have no direct neighbours of that role."""
+        return self._renderer.noise.is_apart(role)
+
     def rays_per_second(self) -> float:
         """Measured speed of the tracer on this machine, over pixels from the whole region, rays/s."""
         if self._is_dark:

@@ -1,4 +1,4 @@
-"""Forecast of the time and memory of a run, from pilot passes over a few patches of the picture."""
+"""Forecast of the time and memory of a run, from pilot passes over a sample of the pixels."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ from hesim_render.sources.render.change_driven.anchor import anchor_us, period_u
 from hesim_render.sources.renderer import Demand, Estimate
 
 if TYPE_CHECKING:
+    from hesim_render.sources.render.change_driven.error_target import Role
     from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
-#: Number of patches, side of a patch, px, and number of blocks over the run, in which rays are counted.
-_PATCHES, _SIDE, _BLOCKS = 12, 12, 3
+#: Number of patches, side of a patch, px, and number of blocks over the run, in which rays are counted. Most rays are
+#: spent on few pixels, so many small patches tell more than few large ones.
+_PATCHES, _SIDE, _BLOCKS = 192, 4, 3
+#: Number of pixels, where these have no neighbours of their kind.
+_SINGLE = 4096
 #: Memory of the program with its kernels, per event pixel and window of a block, and per event pixel and frame pixel
 #: of the stages, bytes.
 _BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 14, 110, 60
@@ -39,7 +43,7 @@ def forecast(source: ChangeDrivenFlux, demand: Demand) -> Estimate:
         every = demand.blocks.blocks
         windows = max(block.wanted.size for block in every)
         chosen = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, _BLOCKS).astype(int))]
-        patch = _patches(event_pixel, source, rng)
+        patch = _sample(event_pixel, source, "events", rng)
         # the last block goes beyond the end of the run, which counts where all blocks are looked at
         is_all = len(chosen) == len(every)
         ends = [int(np.flatnonzero(b.wanted)[-1]) if is_all and b.wanted.any() else None for b in chosen]
@@ -62,7 +66,7 @@ def forecast(source: ChangeDrivenFlux, demand: Demand) -> Estimate:
     # frames; of a static scene each pixel once, those of events included
     pixel = demand.pixels if is_static else np.unique(demand.frame_pixel if exposures else demand.frame_pixel[:0])
     if pixel.size:
-        patch = _patches(pixel, source, rng)
+        patch = _sample(pixel, source, "any", rng)
         begin, end = (0.0, 1000.0) if not exposures else (float(exposures[0].start_us), float(exposures[0].t_us))
         each_frame = source.foretell(patch, np.array([begin]), np.array([end]), "any").sum()
         rays += each_frame * pixel.size * (1 if is_static else len(exposures))
@@ -75,11 +79,21 @@ def forecast(source: ChangeDrivenFlux, demand: Demand) -> Estimate:
     )
 
 
-def _patches(pixel: NDArray[np.uint32], source: ChangeDrivenFlux, rng: np.random.Generator) -> NDArray[np.uint32]:
-    """Listed pixels in some small squares. Squares keep neighbours together, as in the run."""
+def _sample(
+    pixel: NDArray[np.uint32], source: ChangeDrivenFlux, role: Role, rng: np.random.Generator
+) -> NDArray[np.uint32]:
+    """Listed pixels in some small squares, which keep neighbours together, as in the run; single ones without
+    neighbours.
+    """
+    is_apart = source.is_apart(role)
+    count = min(_SINGLE if is_apart else _PATCHES, pixel.size)
+    # one of each part of the list, so that all rows are seen
+    chosen = ((np.arange(count) + rng.random(count)) * (pixel.size / count)).astype(np.int64)
+    if is_apart:
+        return pixel[chosen]
     row, col = np.divmod(pixel.astype(np.int64), source.sensor.cols)
     side = _SIDE * max(1.0, np.sqrt(source.sensor.rows * source.sensor.cols / pixel.size))
     is_inside = np.zeros(pixel.size, np.bool_)
-    for centre in rng.choice(pixel.size, _PATCHES):
+    for centre in chosen:
         is_inside |= (np.abs(row - row[centre]) <= side / 2) & (np.abs(col - col[centre]) <= side / 2)
     return pixel[is_inside]
