@@ -56,6 +56,8 @@ class Blocks:
             pilots = [pilot for _, pilot in kept]
             self._bands = [band for band, _ in kept]
         else:
+            # those of all pixels are let go before the others are traced: they hold half a gigabyte of a large sensor
+            kept.clear()
             pilots, self._bands = [], list(renderer.bands(pixel[self.alive], "events"))
         self._anchors = [
             Anchor(renderer, band, span_us, known.at(band.place), near_us, pilot)
