@@ -372,7 +372,7 @@ def test_last_event_rate_does_not_follow_the_slices():
     of a difference is asserted to be below 0.4 %: 2 % is 5 of those, a false alarm in 600,000 runs.
     """
     noise = asynchronous(
-        512, evs__coefficients=[{"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 0.06, "beta5": 0.0}]
+        512, evs__coefficients=[{"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 0.071, "beta5": 0.0}]
     )
     duration_us = 40_000
     totals, errors = [], []
