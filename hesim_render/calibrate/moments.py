@@ -47,6 +47,7 @@ class FrameMoments:
     half_means : float64 [exposure, frame, 2], mean over the dimmer and over the brighter half of the used pixels, by
         the first frame of the exposure; without those near an end of the ADC's range.
     half : int8 [exposure, row, col], 0 for the dimmer half, 1 for the brighter half, −1 for other pixels.
+    col_means : float64 [exposure, frame, col], mean over the used pixels of a column; 0 where it has none.
     """
 
     exposures_us: NDArray[np.int64]
@@ -59,6 +60,7 @@ class FrameMoments:
     row_means: NDArray[np.float64]
     half_means: NDArray[np.float64]
     half: NDArray[np.int8]
+    col_means: NDArray[np.float64]
 
     @property
     def exposures_s(self) -> NDArray[np.float64]:
@@ -83,12 +85,13 @@ def measure(
     variance = np.empty_like(mean)
     lowest, highest, first = (np.empty((exposures, rows, cols), np.uint16) for _ in range(3))
     row_means, half_means = np.empty((exposures, frames, rows)), np.empty((exposures, frames, 2))
+    col_means = np.empty((exposures, frames, cols))
     half = np.empty((exposures, rows, cols), np.int8)
     total = np.empty((rows, cols), np.int32)
     squares = np.empty((rows, cols), np.int64)
     difference = np.empty((rows, cols), np.int32)
     taken = used.astype(np.int32)
-    row_pixels = np.maximum(used.sum(axis=1), 1)
+    row_pixels, col_pixels = (np.maximum(used.sum(axis=axis), 1) for axis in (1, 0))
     for number, frame in enumerate(stack):
         source, index = divmod(number, frames)
         k = place[source]
@@ -101,12 +104,15 @@ def measure(
             half_pixels = [max(int(mask.sum()), 1) for mask in halves]
             row_first = (first[k] * taken).sum(axis=1) / row_pixels
             row_means[k, 0] = row_first
+            col_first = (first[k] * taken).sum(axis=0) / col_pixels
+            col_means[k, 0] = col_first
             half_first = [float((first[k] * m).sum()) / n for m, n in zip(halves, half_pixels, strict=True)]
             half_means[k, 0] = half_first
         else:
             # differences from it are small whole numbers, so that no sum below is rounded
             np.subtract(frame, first[k], out=difference, dtype=np.int32)
             row_means[k, index] = row_first + np.einsum("ij,ij->i", difference, taken) / row_pixels
+            col_means[k, index] = col_first + np.einsum("ij,ij->j", difference, taken) / col_pixels
             for side, mask in enumerate(halves):
                 change = np.einsum("ij,ij->i", difference, mask).sum(dtype=np.int64)
                 half_means[k, index, side] = half_first[side] + change / half_pixels[side]
@@ -123,7 +129,8 @@ def measure(
             if progress is not None:
                 progress(f"reading {stack.file.name}", (source + 1) / exposures)
     return FrameMoments(
-        np.sort(stack.exposures_us), frames, mean, variance, lowest, highest, first, row_means, half_means, half
+        np.sort(stack.exposures_us), frames, mean, variance, lowest, highest, first, row_means, half_means, half,
+        col_means,
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from hesim_render.calibrate.aps.pair_levels import Levels
 from hesim_render.calibrate.aps.pairs import PairCalibration, light_of
 from hesim_render.pixels.aps.formulas import polynomial
 from hesim_render.recording.pair_set import PairSet
-from hesim_render.twin.figures import bin_edges, counts_in, deviations, spectra, without_lines
+from hesim_render.twin.figures import bin_edges, counts_in, deviations, spectra, without_defects, without_lines
 
 #: Probability that one check fails for a twin that is right.
 ALARM = 1e-3
@@ -206,7 +206,7 @@ def _spatial(result: PairCalibration, real: Half, twin: Half) -> list[Check]:
             Check(f"defects, histogram, {name}", "pixels", "deviation, " + ("DN" if name == "dark" else "relative"),
                   edges[:-1], counts[0], counts[1], np.sqrt(np.maximum(counts[0] + counts[1], 1.0)))
         )  # fmt: skip
-        outcome = [spectra(s, f) for s, f in zip(series, scale, strict=True)]
+        outcome = [spectra(without_defects(s, result.defects), f) for s, f in zip(series, scale, strict=True)]
         for direction in ("rows", "columns"):
             here = [f[direction] for f in outcome]
             error = np.sqrt(sum(s.error**2 for s in here))

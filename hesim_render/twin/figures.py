@@ -14,8 +14,8 @@ from hesim_render.calibrate.aps.spatial import spatial_variance
 
 #: Bands of spatial frequency, of equal numbers of frequencies.
 _BANDS = 20
-#: Bins of the histogram of deviations, and the fewest pixels of one.
-_BINS, _FEWEST = 24, 16
+#: Bins of the histogram of deviations up to so many median deviations, bins above, and the fewest pixels of one.
+_BINS, _COMMON, _MORE_BINS, _FEWEST = 18, 7.0, 8, 16
 #: Box that separates shading from pixels, px.
 _BOX = 15
 
@@ -102,7 +102,30 @@ def without_lines(series: Long, temporal: NoiseSpectrum) -> Long:
     mean = np.fft.irfft2(transform, series.mean.shape)
     pixel = series.temporal.pixel - sum(line.rms_dn**2 for line in temporal.lines)
     changes = replace(series.temporal, pixel=pixel)
-    return replace(series, mean=mean, spatial=spatial_variance(mean, changes, series.frames))
+    spatial = spatial_variance(mean, changes, series.frames, series.variance)
+    return replace(series, mean=mean, temporal=changes, spatial=spatial)
+
+
+def without_defects(series: Long, defects: NDArray[np.bool_]) -> Long:
+    """The series with the means of row and column in place of defects.
+
+    A hot pixel adds to all frequencies alike, and so does its noise: no error of a band would tell it from a pattern.
+    The histogram of deviations has these pixels.
+    """
+    good = ~defects
+    if not defects.any() or not good.any():
+        return series
+    level = float(series.mean[good].mean())
+    profiles = []
+    for axis in (1, 0):
+        count = good.sum(axis=axis)
+        total = np.sum(np.where(good, series.mean - level, 0.0), axis=axis)
+        profiles.append(total / np.maximum(count, 1))
+    plain = level + profiles[0][:, None] + profiles[1]
+    mean = np.where(good, series.mean, plain)
+    less = float(series.variance.mean(dtype=np.float64) - series.variance[good].mean(dtype=np.float64))
+    temporal = replace(series.temporal, pixel=series.temporal.pixel - less)
+    return replace(series, mean=mean, temporal=temporal, spatial=spatial_variance(mean, temporal, series.frames))
 
 
 def deviations(image: NDArray) -> NDArray[np.float64]:
@@ -113,9 +136,16 @@ def deviations(image: NDArray) -> NDArray[np.float64]:
 
 
 def bin_edges(*images: NDArray) -> NDArray[np.float64]:
-    """Edges of a histogram of deviations: each bin with some pixels of all images together, the last one open."""
+    """Edges of a histogram of deviations: each bin with some pixels of all images together, the last one open.
+
+    Bins are of equal width up to some median deviations, and grow from there on: hot pixels are a hundred times as far.
+    """
     everything = np.concatenate([image.ravel() for image in images])
-    edges = list(np.linspace(0.0, float(everything.max()), _BINS + 1))
+    most = float(everything.max())
+    common = min(_COMMON * float(np.median(everything)), most)
+    edges = list(np.linspace(0.0, common, _BINS + 1))
+    if 0 < common < most:
+        edges += list(np.geomspace(common, most, _MORE_BINS + 1)[1:])
     counts = np.histogram(everything, edges)[0]
     while len(counts) > 1 and counts.min() < 2 * _FEWEST:
         thin = int(np.argmin(counts))

@@ -46,6 +46,8 @@ def test_moments_are_those_of_numpy_in_any_order_of_exposures(frames):
     np.testing.assert_array_equal(moments.lowest, stack.min(axis=1))
     rows = (stack * used).sum(axis=3) / np.maximum(used.sum(axis=1), 1)
     np.testing.assert_allclose(moments.row_means, rows, rtol=1e-12)
+    cols = (stack * used).sum(axis=2) / np.maximum(used.sum(axis=0), 1)
+    np.testing.assert_allclose(moments.col_means, cols, rtol=1e-12)
     for k, first in enumerate(stack[:, 0]):
         clear = used & (first < 0.9 * 1023)
         bright = clear & (first > np.median(first[clear]))

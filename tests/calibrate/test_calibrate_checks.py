@@ -112,7 +112,7 @@ def test_row_noise_of_few_wide_and_narrow_rows_has_no_bias():
         mean, variance = stack.mean(axis=1), stack.var(axis=1, ddof=1).astype(np.float32)
         ends = np.full(mean.shape, 100, np.uint16)
         moments = FrameMoments(np.array([1000]), 6, mean, variance, ends, ends, ends, stack.mean(axis=3),
-                          np.zeros((1, 6, 2)), np.zeros(mean.shape, np.int8))  # fmt: skip
+                          np.zeros((1, 6, 2)), np.zeros(mean.shape, np.int8), stack.mean(axis=2))  # fmt: skip
         found.append(common_mode.row_noise(moments, used).variance)
         left.append(common_mode.without_rows(moments, used, 1023, 4.0).variance.mean())
     for values, true in ((found, 4.0), (left, 1.0)):
@@ -128,7 +128,7 @@ def test_the_error_of_the_row_noise_is_its_scatter():
         mean, variance = stack.mean(axis=1), stack.var(axis=1, ddof=1).astype(np.float32)
         ends = np.full(mean.shape, 100, np.uint16)
         moments = FrameMoments(np.array([1000]), 5, mean, variance, ends, ends, ends, stack.mean(axis=3),
-                          np.zeros((1, 5, 2)), np.zeros(mean.shape, np.int8))  # fmt: skip
+                          np.zeros((1, 5, 2)), np.zeros(mean.shape, np.int8), stack.mean(axis=2))  # fmt: skip
         found.append(common_mode.row_noise(moments, used))
     assert np.median([each.error for each in found]) == pytest.approx(
         np.std([each.variance for each in found]), rel=0.12
@@ -311,7 +311,7 @@ def test_drift_of_black_and_of_light_are_told_apart_to_the_number():
     flat = np.full((1, size, size), 9.0, np.float32)
     empty = np.zeros((1, size, size), np.uint16)
     rows = np.zeros((1, frames, size))
-    moments = FrameMoments(np.array([1000]), frames, flat, flat, empty, empty, empty, rows, means[None], half[None])
+    moments = FrameMoments(np.array([1000]), frames, flat, flat, empty, empty, empty, rows, means[None], half[None], rows)
     drift = common_mode.frame_drift(moments, 0, 0.0, levels[half])
     assert drift.black.variance == pytest.approx(black[1:].var(ddof=1), rel=0.05)
     assert drift.light.variance == pytest.approx(light[1:].var(ddof=1), rel=0.02)

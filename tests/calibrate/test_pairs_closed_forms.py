@@ -206,24 +206,27 @@ def test_a_filter_of_the_read_out_makes_no_lines_and_hides_none(frames):
 
 
 def test_temporal_variances_of_a_series_are_unbiased():
-    """600 series of 5 frames: pixels 4, rows 2.2, whole frames 1.3 DN²; the error of rows is their scatter."""
+    """600 series of 5 frames: pixels 4, rows 2.2, columns 0.8, whole frames 1.3 DN²; the errors of rows and columns are
+    their scatter."""
     rng, frames, rows, cols = np.random.default_rng(11), 5, 8, 13
     found, errors = [], []
     for _ in range(600):
         stack = 2 * rng.standard_normal((frames, rows, cols)) + np.sqrt(2.2) * rng.standard_normal((frames, rows, 1))
         stack += np.sqrt(1.3) * rng.standard_normal((frames, 1, 1)) + rng.standard_normal((rows, cols))
+        stack += np.sqrt(0.8) * rng.standard_normal((frames, 1, cols))
         moments = SimpleNamespace(
-            variance=stack.var(axis=0, ddof=1)[None], frames=frames, row_means=stack.mean(axis=2)[None]
-        )
+            variance=stack.var(axis=0, ddof=1)[None], frames=frames, row_means=stack.mean(axis=2)[None],
+            col_means=stack.mean(axis=1)[None],
+        )  # fmt: skip
         temporal, levels = spatial.temporal_of(moments)
         np.testing.assert_allclose(levels, stack.mean(axis=(1, 2)))
-        found.append((temporal.pixel, temporal.row, temporal.frame))
-        errors.append(temporal.row_error)
+        found.append((temporal.pixel, temporal.row, temporal.col, temporal.frame))
+        errors.append((temporal.row_error, temporal.col_error))
     found = np.array(found)
     sure = found.std(axis=0, ddof=1) / np.sqrt(600)
-    # a frame's variance below 0 counts as none in the pixels' part, which adds a little
-    assert np.all(np.abs(found.mean(axis=0) - (4, 2.2, 1.3)) < 3.5 * sure + (0.02, 0, 0))
-    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(found[:, 1].std(ddof=1), rel=0.1)
+    assert np.all(np.abs(found.mean(axis=0) - (4, 2.2, 0.8, 1.3)) < 3.5 * sure)
+    expected = found[:, 1:3].std(axis=0, ddof=1)
+    assert np.sqrt(np.mean(np.square(errors), axis=0)) == pytest.approx(expected, rel=0.1)
 
 
 def test_spatial_variances_are_those_of_means_less_noise_and_pixels():

@@ -520,7 +520,7 @@ def test_variances_of_good_pixels_are_not_looked_at():
     level = np.full(true.shape, 64, np.uint16)
     moments = FrameMoments(
         np.rint(EXPOSURES_S * 1e6).astype(np.int64), frames, mean.astype(np.float32), variance.astype(np.float32),
-        level, level, level, np.empty(0), np.empty(0), np.empty(0, np.int8),
+        level, level, level, np.empty(0), np.empty(0), np.empty(0, np.int8), np.empty(0),
     )  # fmt: skip
     used = np.ones((side, side), bool)
     assert _suspects(moments, used, (2, 2), 1023).sum() < 8

@@ -159,6 +159,35 @@ def test_errors_of_a_spectrum_are_those_of_its_noise(pixel, shared):
     assert np.all(np.abs(ratio - 1) < 0.25) and abs(ratio.mean() - 1) < 0.05
 
 
+def test_a_hot_pixel_is_taken_out_of_spectra_with_its_noise():
+    """Its value becomes that of its row and column, and the others' noise is that of the mean."""
+    rng = np.random.default_rng(7)
+    rows, cols = rng.standard_normal((12, 1)), rng.standard_normal(20)
+    variance = np.full((12, 20), 2.5, np.float32)
+    hot = np.zeros((12, 20), bool)
+    hot[3, 4] = hot[7, 4] = True
+    series = Long(
+        mean=5.0 + rows + cols + 60 * hot, variance=variance + 300 * hot, first=None, frames=10, levels=None,
+        temporal=Temporal(5.0, 0.3, 0.2, 0.0, 0.1, 0.1), spatial=None, spectrum=None,
+    )  # fmt: skip
+    found = figures.without_defects(series, hot)
+    good = ~hot
+    np.testing.assert_array_equal(found.mean[good], series.mean[good])
+    # a row that lacks one column has the others' mean
+    np.testing.assert_allclose(found.mean[hot], (5.0 + rows + cols)[hot], atol=0.4)
+    assert found.spatial.noise[2] == pytest.approx((5.0 - 2 * 300 / 240) / 10)
+    assert figures.without_defects(series, np.zeros((12, 20), bool)) is series
+
+
+def test_bins_of_deviations_tell_common_pixels_apart_where_a_few_are_hot():
+    """A hundred pixels reach a hundred times as far as all others, which still have many bins of equal width."""
+    a, b = np.abs(np.random.default_rng(1).standard_normal((2, 80, 90)))
+    a[3], b[3] = np.linspace(5, 400, 90), np.linspace(5, 400, 90)
+    edges = bin_edges(a, b)
+    assert np.sum(edges < 3) > 10 and np.sum(edges > 20) >= 2
+    assert (counts_in(a, edges) + counts_in(b, edges)).min() >= 32
+
+
 def test_bins_of_deviations_are_not_empty_and_hold_every_pixel():
     rng = np.random.default_rng(1)
     a, b = np.abs(rng.standard_normal((80, 90))), np.abs(rng.standard_normal((80, 90)))
@@ -294,8 +323,9 @@ def test_spatial_checks_are_relative_to_each_ones_own_signal(monkeypatch):
         return {"rows": some, "columns": some}
 
     monkeypatch.setattr(comparison, "without_lines", lambda series, _: series)
+    monkeypatch.setattr(comparison, "without_defects", lambda series, defects: series)
     monkeypatch.setattr(comparison, "spectra", spectra)
-    result = SimpleNamespace(lit=None, dark=None, long_dark=own.long_dark, long_lit=own.long_lit, noise_spectrum=None)
+    result = SimpleNamespace(lit=None, dark=None, long_dark=own.long_dark, long_lit=own.long_lit, noise_spectrum=None, defects=None)
     found = {check.name: check for check in comparison._spatial(result, real, twin)}
     signal = [h.long_lit.mean.mean() - h.long_dark.mean.mean() for h in (real, twin, own)]
     assert powers == pytest.approx([1, 1, 1, *signal])
@@ -330,7 +360,7 @@ def test_interference_is_taken_out_of_image_and_noise():
         mean=rest + waves,
         spatial=None,
         temporal=temporal,
-        variance=None,
+        variance=np.full((12, 20), 4.5),
         first=None,
         frames=14,
         levels=None,
@@ -338,7 +368,7 @@ def test_interference_is_taken_out_of_image_and_noise():
     )
     found = figures.without_lines(series, SimpleNamespace(lines=lines))
     np.testing.assert_allclose(found.mean, rest, atol=1e-12)
-    assert found.temporal.pixel == 4.0
+    assert found.temporal.pixel == pytest.approx(4.0 - 0.9**2 - 0.6**2) and series.temporal.pixel == 4.0
     assert found.spatial.noise[2] == pytest.approx((4.0 - 0.9**2 - 0.6**2) / 14)
 
 

@@ -65,5 +65,5 @@ def long_of(moments: FrameMoments, spectrum: NoiseSpectrum | None) -> Long:
     """A long series from the moments of its frames."""
     mean = moments.mean[0].astype(np.float64)
     temporal, levels = temporal_of(moments)
-    spatial = spatial_variance(mean, temporal, moments.frames)
+    spatial = spatial_variance(mean, temporal, moments.frames, moments.variance[0])
     return Long(mean, moments.variance[0], moments.first[0], moments.frames, levels, temporal, spatial, spectrum)

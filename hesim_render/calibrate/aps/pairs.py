@@ -328,14 +328,19 @@ def _relative(
 ) -> tuple[NDArray[np.float64], tuple[float, float, float]]:
     """Response of each pixel relative to the mean, less 1, and the noise of its row, column and pixel means.
 
-    Where the curve bends, a pixel with 1 % more light has less than 1 % more signal; this is taken back.
+    Where the curve bends, a pixel with 1 % more light has less than 1 % more signal; this is taken back. The dark
+    pattern that is subtracted is the expected one: the noise of the dark mean would be in the response with its sign
+    changed, and the lit pattern of a twin, which has both, be too small.
     """
-    signal = lit.mean - dark.mean
+    expected = pattern_of(dark.mean, dark.spatial.noise, dark.spectrum, dark.frames, expected=True)
+    signal = lit.mean - dark.mean.mean() - expected.whole
     level = float(signal.mean())
     places = np.linspace(float(light.min()), float(light.max()), 512)
     here = float(np.interp(level, curve.at(places), places))
     shifted = here + curve.offset
     exponent = float(curve.gradient(np.array([here]))[0, 0]) * shifted / float(curve.at(np.array([here]))[0])
     scale = level * exponent
-    noise = np.add(lit.spatial.noise, dark.spatial.noise) / scale**2
+    # of the dark pattern that part is unknown which is as large as what is known of its noise
+    own, given = np.maximum(dark.spatial.parts, 0.0), np.array(dark.spatial.noise)
+    noise = (np.array(lit.spatial.noise) + given * own / np.maximum(own + given, 1e-300)) / scale**2
     return (signal / level - 1) / exponent, (float(noise[0]), float(noise[1]), float(noise[2]))

@@ -50,6 +50,8 @@ class SpatialVariance:
     row, col, pixel : parts; their sum is `total`.
     noise : temporal variance of the mean that each part had: row, column, pixel.
     freedom : degrees of freedom of each part.
+    scatter : variance of `pixel` times its degrees of freedom, of noise alone; of pixels whose noise is not alike, as
+        that of hot ones. None where it is that of pixels which are alike.
     """
 
     row: float
@@ -57,6 +59,7 @@ class SpatialVariance:
     pixel: float
     noise: tuple[float, float, float]
     freedom: tuple[int, int, int]
+    scatter: float | None = None
 
     @property
     def total(self) -> float:
@@ -79,6 +82,8 @@ class SpatialVariance:
         values[1] += values[2] / (self.freedom[0] + 1)
         noise, freedom = np.array(self.noise), np.array(self.freedom)
         scatter = (4 * values * noise + 2 * noise**2) if fixed else 2 * (values + noise) ** 2
+        if fixed and self.scatter is not None:
+            scatter[2] = self.scatter
         each = np.sqrt(scatter / freedom)
         return np.append(each, np.sqrt(np.sum(each**2)))
 
@@ -89,22 +94,28 @@ def temporal_of(moments: FrameMoments) -> tuple[Temporal, NDArray[np.float64]]:
     frames = moments.frames
     whole = float(moments.variance[0].mean(dtype=np.float64))
     levels = moments.row_means[0].mean(axis=1)
-    change = moments.row_means[0] - moments.row_means[0].mean(axis=0)
-    # without the change of the whole frame
-    change = change - change.mean(axis=1)[:, None]
-    of_rows = float(np.sum(change**2)) / ((frames - 1) * (rows - 1))
-    # of_rows = R + σ²/cols, and the mean variance of a pixel about its own row is σ² (1 − 1/cols)
-    row = of_rows - (whole - float(levels.var(ddof=1)) - of_rows) / (cols - 1)
-    own = whole - max(row, 0.0)
-    # variance of the frames' levels beyond that of their pixels and rows
-    frame = float(levels.var(ddof=1)) - own / (rows * cols) - max(row, 0.0) / rows
-    own -= max(frame, 0.0)
-    freedom = (frames - 1) * (rows - 1)
-    return Temporal(own, row, 0.0, frame, of_rows * float(np.sqrt(2 / freedom)), 0.0), levels
+    level = float(levels.var(ddof=1))
+
+    def of(means: NDArray) -> tuple[float, float]:
+        """Variance of the changes of rows or columns, without those of the whole frame, and its standard error."""
+        change = means - means.mean(axis=0)
+        change = change - change.mean(axis=1)[:, None]
+        freedom = (frames - 1) * (means.shape[1] - 1)
+        value = float(np.sum(change**2)) / freedom
+        return value, value * float(np.sqrt(2 / freedom))
+
+    (of_rows, row_error), (of_cols, col_error) = of(moments.row_means[0]), of(moments.col_means[0])
+    # with R, C and F of rows, columns and frames: of_rows = R + σ²/cols, of_cols = C + σ²/rows, a pixel's own variance
+    # is σ² + R + C + F, and that of the levels F + R/rows + C/cols + σ²/(rows cols)
+    pixel = (whole - level) / ((1 - 1 / rows) * (1 - 1 / cols)) - of_rows / (1 - 1 / cols) - of_cols / (1 - 1 / rows)
+    frame = level - of_rows / rows - of_cols / cols + pixel / (rows * cols)
+    return Temporal(pixel, of_rows - pixel / cols, of_cols - pixel / rows, frame, row_error, col_error), levels
 
 
-def spatial_variance(mean: NDArray, temporal: Temporal, frames: int) -> SpatialVariance:
-    """Row, column and pixel variance of a mean image.
+def spatial_variance(
+    mean: NDArray, temporal: Temporal, frames: int, variance: NDArray | None = None
+) -> SpatialVariance:
+    """Row, column and pixel variance of a mean image; with the temporal variance of each pixel, errors that follow it.
 
     EMVA 1288 R4.0 solves the three equations of the variances of row means, of column means and of all pixels; this is
     the same with degrees of freedom in place of numbers, and with what rows and columns share from frame to frame.
@@ -120,7 +131,15 @@ def spatial_variance(mean: NDArray, temporal: Temporal, frames: int) -> SpatialV
     # row means contain the mean of their pixels, of the pattern and of noise
     row = float(by_row.var(ddof=1)) - max(pixel - noise_pixel, 0.0) / cols - noise[0]
     col = float(by_col.var(ddof=1)) - max(pixel - noise_pixel, 0.0) / rows - noise[1]
-    return SpatialVariance(row, col, pixel - noise_pixel, noise, freedom)
+    scatter = None
+    if variance is not None:
+        own = variance.astype(np.float64)
+        own += temporal.pixel - own.mean()  # without what rows, columns and frames share
+        own /= frames
+        # of a pixel's square with the pattern's p² and noise u: 4 p² u + 2 u²; that of u itself is taken off
+        alone = 2 * float(np.mean(own**2)) * (frames - 1) / (frames + 1)
+        scatter = max(4 * float(np.mean((rest**2 - own) * own)), 0.0) + alone
+    return SpatialVariance(row, col, pixel - noise_pixel, noise, freedom, scatter)
 
 
 @dataclass(frozen=True)
@@ -148,7 +167,11 @@ class Pattern:
 
 
 def pattern_of(
-    image: NDArray, noise: tuple[float, float, float], spectrum: NoiseSpectrum | None = None, frames: int = 1
+    image: NDArray,
+    noise: tuple[float, float, float],
+    spectrum: NoiseSpectrum | None = None,
+    frames: int = 1,
+    expected: bool = False,
 ) -> Pattern:
     """The pattern of a mean image.
 
@@ -161,25 +184,35 @@ def pattern_of(
     noise : variance of the noise of row means, column means and pixels.
     spectrum : of the temporal noise; at the frequency of an interference, the mean has more noise.
     frames : frames of the mean.
+    expected : the pattern that is expected, whose errors are smallest and whose variance is smaller than the pattern's.
     """
+    power_law = 1.0 if expected else 0.5
     level = float(image.mean())
     by_row, by_col = image.mean(axis=1) - level, image.mean(axis=0) - level
     rest = image - level - by_row[:, None] - by_col
     spread = 1.4826 * float(np.median(np.abs(rest)))
     # single pixels that stand out would ring in a transform
     plain = np.clip(rest, -_INDIVIDUAL * spread, _INDIVIDUAL * spread)
-    waves = _waves(plain, noise[2], spectrum, frames)
+    waves = _waves(plain, noise[2], spectrum, frames, power_law)
     rest = rest - waves
     smooth = uniform_filter(plain - waves, _BOX, mode="nearest")
     part = 1 / _BOX**2
     # what is left of the noise when a box mean was taken out
-    fine = _scaled(rest - smooth, noise[2] * (1 - part))
+    fine = _scaled(rest - smooth, noise[2] * (1 - part), power_law)
     power = float(np.mean(smooth**2))
-    smooth *= np.sqrt(max(0.0, power - noise[2] * part) / max(power, 1e-300))
-    return Pattern(_profile(by_row, noise[0]), _profile(by_col, noise[1]), waves + smooth + fine)
+    smooth *= _true_part(power, noise[2] * part) ** power_law
+    profiles = _profile(by_row, noise[0], power_law), _profile(by_col, noise[1], power_law)
+    return Pattern(*profiles, waves + smooth + fine)
 
 
-def _waves(values: NDArray, noise: float, temporal: NoiseSpectrum | None, frames: int) -> NDArray[np.float64]:
+def _true_part(power: NDArray | float, noise: NDArray | float) -> NDArray[np.float64]:
+    """Part of a power that is not noise."""
+    return np.asarray(np.maximum(0.0, power - noise) / np.maximum(power, 1e-300))
+
+
+def _waves(
+    values: NDArray, noise: float, temporal: NoiseSpectrum | None, frames: int, law: float = 0.5
+) -> NDArray[np.float64]:
     """The frequencies of an image that stand out of its white part and of interference: shading, periodic patterns."""
     spectrum = np.fft.rfft2(values)
     power = np.abs(spectrum) ** 2 / values.size
@@ -193,30 +226,27 @@ def _waves(values: NDArray, noise: float, temporal: NoiseSpectrum | None, frames
     white = np.maximum(noises, max(float(np.median(power)) / np.log(2.0), 1e-300))
     # the power of white noise is exponential: a share `_PEAK_CHANCE` of images has one above this
     peak = power > white * np.log(power.size / _PEAK_CHANCE)
-    own = np.sqrt(np.maximum(0.0, 1 - noises / np.maximum(power, 1e-300)))
+    own = _true_part(power, noises) ** law
     return np.asarray(np.fft.irfft2(np.where(peak, spectrum * own, 0.0), values.shape))
 
 
-def _scaled(values: NDArray, noise: float) -> NDArray[np.float64]:
+def _scaled(values: NDArray, noise: float, law: float = 0.5) -> NDArray[np.float64]:
     """Pixels scaled to the variance that they have without noise; individuals lose only what noise adds on average."""
     power = values**2
     spread = 1.4826 * float(np.median(np.abs(values)))
     alone = power > (_INDIVIDUAL * max(spread, float(np.sqrt(noise)))) ** 2
     common = float(power[~alone].mean()) if not alone.all() else 0.0
-    factor = np.sqrt(max(0.0, common - noise) / max(common, 1e-300))
-    own = np.sqrt(np.maximum(0.0, 1 - noise / np.maximum(power, 1e-300)))
-    return values * np.where(alone, own, factor)
+    return values * np.where(alone, _true_part(power, noise), _true_part(common, noise)) ** law
 
 
-def _profile(values: NDArray, noise: float) -> NDArray[np.float64]:
+def _profile(values: NDArray, noise: float, law: float = 0.5) -> NDArray[np.float64]:
     """A profile, scaled frequency by frequency; frequencies that stand out keep their power less that of the noise."""
     spectrum = np.fft.rfft(values)
     power = np.abs(spectrum) ** 2 / values.size
     peak = power > max(noise, 1e-300) * np.log(power.size / _PEAK_CHANCE)
     common = float(power[~peak].mean()) if not peak.all() else 0.0
-    factor = np.sqrt(max(0.0, common - noise) / max(common, 1e-300))
-    own = np.sqrt(np.maximum(0.0, 1 - noise / np.maximum(power, 1e-300)))
-    return np.asarray(np.fft.irfft(spectrum * np.where(peak, own, factor), values.size))
+    part = np.where(peak, _true_part(power, noise), _true_part(common, noise))
+    return np.asarray(np.fft.irfft(spectrum * part**law, values.size))
 
 
 def outliers(image: NDArray, noise: tuple[float, float, float], sigmas: float = 8.0) -> NDArray[np.bool_]:
