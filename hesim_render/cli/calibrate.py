@@ -257,8 +257,10 @@ def twin(
         )
     lines = [check_line(check) for check in result.checks]
     passed = sum(check.passed for check in result.checks)
-    text = "\n".join([*lines, f"{passed} of {len(lines)} pass", f"in {out}"])
-    facts = {"twin": result.folder, "passed": result.passed, "checks": {c.name: c.passed for c in result.checks}}
+    looks = [f"look at: {finding.check}: {finding.text}" for finding in result.findings]
+    text = "\n".join([*lines, *looks, f"{passed} of {len(lines)} pass", f"in {out}"])
+    facts = {"twin": result.folder, "passed": result.passed, "checks": {c.name: c.passed for c in result.checks},
+             "findings": [finding.described() for finding in result.findings]}  # fmt: skip
     console.result(text, facts, ExitStatus.DONE if result.passed else ExitStatus.NOT_MET)
 
 

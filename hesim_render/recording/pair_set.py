@@ -51,6 +51,7 @@ class PairSet:
     lit, dark : pairs in order of light and exposure; ``dark[k]`` belongs to ``lit[k]``, and one may stand there often.
     spatial_lit, spatial_dark : series of many frames that are used.
     long : all of them, lit and dark, where there are several lights.
+    halved : every second exposure of a set alone.
     tile, position : rows and columns of a colour mosaic, and the place in it whose pixels are the frames.
     """
 
@@ -64,6 +65,7 @@ class PairSet:
     long: tuple[tuple[Series, Series], ...] = ()
     tile: tuple[int, int] = (1, 1)
     position: tuple[int, int] = (0, 0)
+    halved: bool = False
 
     @property
     def has_photons(self) -> bool:
@@ -78,12 +80,12 @@ class PairSet:
         """The set with that long series which is nearest to some light, in photons or else in s of exposure."""
         if len(self.long) < 2:
             return self
-        lit, dark = min(self.long, key=lambda both: abs(_light(both[0], self.has_photons) - light))
+        lit, dark = min(self.long, key=lambda both: abs(light_of_series(both[0], self.has_photons) - light))
         return replace(self, spatial_lit=lit, spatial_dark=dark)
 
     def with_long_of(self, other: PairSet) -> PairSet:
         """The set with the long series of the light that another set of the same list uses."""
-        return self.with_long_at(_light(other.spatial_lit, other.has_photons))
+        return self.with_long_at(light_of_series(other.spatial_lit, other.has_photons))
 
     def half(self, number: int) -> PairSet:
         """Every second exposure and every second frame of the long series, from the first (0) or the second (1) on."""
@@ -93,7 +95,7 @@ class PairSet:
             return replace(series, files=series.files[cut])
 
         return replace(
-            self, lit=self.lit[cut], dark=self.dark[cut],
+            self, halved=True, lit=self.lit[cut], dark=self.dark[cut],
             spatial_lit=of(self.spatial_lit), spatial_dark=of(self.spatial_dark),
             long=tuple((of(lit), of(dark)) for lit, dark in self.long),
         )  # fmt: skip
@@ -244,7 +246,7 @@ def _arranged(file: Path, spec: CaptureSpec, shape: tuple[int, int], series: lis
     dark = _dark_of(pairs[True], pairs[False], [s for s in series if not s.lit])
     long = _long_series(file, series)
     result = PairSet(file, spec, shape, tuple(pairs[True]), tuple(dark), *long[0], long=tuple(long))
-    return result.with_long_at(_LONG_AT * max(_light(entry, result.has_photons) for entry in result.lit))
+    return result.with_long_at(_LONG_AT * max(light_of_series(entry, result.has_photons) for entry in result.lit))
 
 
 def _dark_of(lit: list[Series], dark: list[Series], all_dark: list[Series]) -> list[Series]:
@@ -262,7 +264,9 @@ def _dark_of(lit: list[Series], dark: list[Series], all_dark: list[Series]) -> l
         if nearest is None or not _same(nearest.exposure_s, entry.exposure_s):
             nearest = only
         if nearest is None:
-            raise entry.error("no dark pair of this exposure")
+            raise entry.error(
+                "no dark pair of this exposure; capture one for each, or dark frames of a single exposure for all"
+            )
         result.append(nearest)
     return result
 
@@ -290,8 +294,8 @@ def _same(first_s: float, second_s: float) -> bool:
     return abs(first_s - second_s) <= _SAME_EXPOSURE * max(first_s, second_s)
 
 
-def _light(series: Series, has_photons: bool) -> float:
-    """Photons per pixel, or exposure in s where photons are not stated."""
+def light_of_series(series: Series, has_photons: bool) -> float:
+    """Photons per pixel of a series, or its exposure in s where photons are not stated."""
     return series.photons or 0.0 if has_photons else series.exposure_s
 
 

@@ -22,7 +22,8 @@ def check_line(check: Check) -> str:
     if check.z.size == 1:
         values = f"{float(check.real[0]):.4g} and {float(check.twin[0]):.4g} {check.unit}"
         return f"{verdict} z {check.worst:+.1f} {limit}; {values}"
-    place = f"{check.places[np.argmax(np.abs(check.z))]:.4g} {check.place}"
+    name, _, unit = check.place.rpartition(", ")
+    place = f"{name} {check.places[np.argmax(np.abs(check.z))]:.4g} {unit}".strip()
     rms = f"rms z {check.rms:.2f} (limit {check.most_rms:.2f})"
     return f"{verdict} worst z {check.worst:+.1f} {limit} of {check.z.size}, at {place}; {rms}"
 

@@ -11,10 +11,11 @@ from hesim_render.calibrate.aps.pair_levels import pair_levels
 from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.pairs_output import calibrate_pairs
 from hesim_render.calibrate.aps.sensor_file import write_sensor
+from hesim_render.calibrate.estimate import Finding
 from hesim_render.calibrate.moments import Progress
 from hesim_render.calibrate.result import plain
 from hesim_render.calibration.file import read_maps
-from hesim_render.core.errors import RangeError
+from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.recording.pair_set import read_pair_set
 from hesim_render.sensor.sensor import load_sensor
@@ -23,6 +24,8 @@ from hesim_render.twin.page import page
 from hesim_render.twin.simulated import TwinBench
 
 RESULT_NAME = "twin.json"
+#: Lit pairs of whose every second one a calibration follows.
+_FEWEST_PAIRS = 9
 
 
 @dataclass(frozen=True)
@@ -33,10 +36,12 @@ class Twin:
     ----------
     folder : holds ``calibration.yaml``, ``sensor.yaml``, ``twin.json`` and ``twin.html``.
     checks : one a statistic.
+    findings : what the sensor, or the bench, has beyond a linear model.
     """
 
     folder: Path
     checks: list[Check]
+    findings: list[Finding]
 
     @property
     def passed(self) -> bool:
@@ -74,6 +79,11 @@ def make_twin(
     pairs = read_pair_set(captures)
     if min(len(pairs.spatial_lit.files), len(pairs.spatial_dark.files)) < 8:
         raise pairs.spatial_lit.error("a series of fewer than 8 frames has no two halves")
+    if len(pairs.lit) < _FEWEST_PAIRS:
+        problem = (
+            f"{len(pairs.lit)} lit pairs; a twin is fitted to every second one, and {_FEWEST_PAIRS} are the fewest"
+        )
+        raise SpecError(problem, file=pairs.file)
     fitted, held = pairs.half(0), pairs.half(1)
     with OutputFolder(out, RESULT_NAME, overwrite) as folder, output_errors(folder.target):
         calibration = folder.path / "calibration.yaml"
@@ -90,10 +100,10 @@ def make_twin(
             bench.long(held, True),
         )  # fmt: skip
         checks = compare(result, held, real, twin)
-        texts = [finding.text for finding in findings(result)]
+        found = findings(result)
         (folder.path / RESULT_NAME).write_text(_json(checks, seed), encoding="utf-8")
-        (folder.path / "twin.html").write_text(page(checks, texts), encoding="utf-8")
-    return Twin(folder.target, checks)
+        (folder.path / "twin.html").write_text(page(checks, [finding.text for finding in found]), encoding="utf-8")
+    return Twin(folder.target, checks, found)
 
 
 def _json(checks: list[Check], seed: int) -> str:

@@ -311,7 +311,9 @@ def test_drift_of_black_and_of_light_are_told_apart_to_the_number():
     flat = np.full((1, size, size), 9.0, np.float32)
     empty = np.zeros((1, size, size), np.uint16)
     rows = np.zeros((1, frames, size))
-    moments = FrameMoments(np.array([1000]), frames, flat, flat, empty, empty, empty, rows, means[None], half[None], rows)
+    moments = FrameMoments(
+        np.array([1000]), frames, flat, flat, empty, empty, empty, rows, means[None], half[None], rows
+    )
     drift = common_mode.frame_drift(moments, 0, 0.0, levels[half])
     assert drift.black.variance == pytest.approx(black[1:].var(ddof=1), rel=0.05)
     assert drift.light.variance == pytest.approx(light[1:].var(ddof=1), rel=0.02)

@@ -203,42 +203,6 @@ def test_errors_of_spatial_variances_are_their_scatter(fixed):
         assert np.all(np.abs(values.mean(axis=0) - true) < 4.5 * errors / np.sqrt(800))
 
 
-def test_the_error_of_a_spatial_variance_follows_the_noise_of_each_pixel():
-    """800 mean images of a device with hot pixels, whose noise is a hundred times that of the others."""
-    rng, (rows, cols), frames = np.random.default_rng(8), (31, 22), 9
-    own, noise = rng.standard_normal((rows, cols)), np.full((rows, cols), 3.0)
-    own[rng.integers(0, rows, 5), rng.integers(0, cols, 5)] += 40.0
-    noise[own > 20] = 300.0
-    values, errors = [], []
-    for _ in range(800):
-        image = own + np.sqrt(noise / frames) * rng.standard_normal((rows, cols))
-        variance = noise * rng.chisquare(frames - 1, noise.shape) / (frames - 1)
-        temporal = Temporal(float(variance.mean()), 0.0, 0.0, 0.0, 0.0, 0.0)
-        found = spatial_variance(image, temporal, frames, variance)
-        values.append(found.pixel)
-        errors.append(found.errors(fixed=True)[2])
-    # five pixels decide: 800 draws tell a standard deviation to 3 %
-    assert np.std(values, ddof=1) == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.12)
-
-
-def test_hot_pixels_do_not_widen_the_range_of_grey_values_that_are_expected():
-    """Three in a thousand pixels, up to 700 DN: the others spread over a few DN, all of which occur."""
-    rng = np.random.default_rng(5)
-    first, second = np.rint(60 + 1.4 * rng.standard_normal((2, 96, 128))).astype(np.uint16)
-    for frame in (first, second):
-        frame.flat[:36] = np.linspace(100, 700, 36)
-    absent, expected = pair_levels._gaps(first, second, 4095)
-    assert absent == 0 and expected == pytest.approx(5, abs=1)
-    # two read-outs at 60 and 90 DN have one gap, between them
-    second[:, 64:] += 30
-    first[:, 64:] += 30
-    absent, expected = pair_levels._gaps(first, second, 4095)
-    assert absent == 0 and expected > 30
-    first, second = (6 * (frame // 6) for frame in (first, second))
-    absent, expected = pair_levels._gaps(first, second, 4095)
-    assert absent > 0.7 * expected
-
-
 def test_a_pixel_far_from_all_others_loses_only_its_own_noise():
     """Nine deviations off, where six make a pixel an individual; the others are scaled to their variance."""
     values = np.random.default_rng(9).standard_normal((50, 70))

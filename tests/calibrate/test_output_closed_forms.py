@@ -10,7 +10,7 @@ from hesim_render.calibrate.aps import output as frames_output
 from hesim_render.calibrate.aps import pairs_output
 from hesim_render.calibrate.aps.common_mode import Shared
 from hesim_render.calibrate.aps.pairs_findings import findings
-from hesim_render.calibrate.aps.spatial import SpatialVariance
+from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal
 from hesim_render.calibrate.asynchronous import output as trials_output
 
 #: Half of an interval of 95 % of a normal law, errors.
@@ -31,9 +31,10 @@ def calibration(**changed):
     spatial_dark = SpatialVariance(0.31, 0.12, 1.7, (0.011, 0.017, 0.13), (13, 21, 273))
     spatial_lit = SpatialVariance(0.9, 2.4, 6.1, (0.05, 0.07, 0.9), (13, 21, 273))
     mean = np.full((14, 22), 40.0)
+    dark_noise, lit_noise = Temporal(9.4, 0.12, 0.05, 0.02, 0.0, 0.0), Temporal(31.0, 0.33, 0.21, 0.11, 0.0, 0.0)
     given = {
         "pairs": SimpleNamespace(has_photons=True, shape=(14, 22), is_dark_once=False, long=[0],
-                                 spec=SimpleNamespace(full_scale_dn=255)),
+                                 spatial_lit=SimpleNamespace(photons=250.0), spec=SimpleNamespace(full_scale_dn=255)),
         "dark_noise_is_rounded_off": False,
         "gain": SimpleNamespace(slope=K, error=K * RELATIVE, groups=9),
         "responsivity": SimpleNamespace(slope=0.22, error=0.0031, groups=9),
@@ -42,11 +43,11 @@ def calibration(**changed):
         "lines_dn2": 0.7, "row": (0.62, 0.05), "col": (0.04, 0.03),
         "light": np.array([100.0, 300.0, 900.0, 1500.0]), "saturation": 2, "signal": np.array([22.0, 66, 190, 200]),
         "clear": np.array([1, 1, 0, 0], bool), "lit": lit_pairs(),
-        "long_dark": SimpleNamespace(spatial=spatial_dark, mean=mean),
-        "long_lit": SimpleNamespace(spatial=spatial_lit, mean=mean + 120),
+        "long_dark": SimpleNamespace(spatial=spatial_dark, mean=mean, temporal=dark_noise),
+        "long_lit": SimpleNamespace(spatial=spatial_lit, mean=mean + 120, temporal=lit_noise, frames=16),
         "linearity": (np.array([1, 0, 1, 1], bool), np.array([-0.4, 0.1, 0.9])),
         "curve": SimpleNamespace(at=lambda x: 0.22 * (x + 2) * 1.0021, terms=np.array([0.22, 0, 0]), offset=2.0,
-                                 offset_error=0.51, bends=True, light_rms=4e-4),
+                                 offset_error=0.51, bends=True, light_rms=4e-4, error=lambda x: 1.2e-4 * x),
         "level_rms": 0.0019, "level_chance": 1e-9, "level_chi2": 3.2,
         "noise_spectrum": SimpleNamespace(lines=[], correlated=False, correlation=-0.013, correlation_error=0.02),
     }  # fmt: skip
@@ -178,12 +179,25 @@ def test_findings_of_emva_captures_begin_at_their_limits():
     # columns, DN², whose error on this device is √((4 (c + 1.7/14) 0.017 + 2 · 0.017²)/21): 0.0284 and 0.0273
     for columns, is_seen in ((0.12, True), (0.10, False)):
         some = SpatialVariance(0.31, columns, 1.7, (0.011, 0.017, 0.13), (13, 21, 273))
-        assert ("column pattern" in named(long_dark=SimpleNamespace(spatial=some))) is is_seen
-    limit = 3 * np.sqrt(0.62 / (2 * 14)) + 0.01
+        dark = SimpleNamespace(**{**vars(calibration().long_dark), "spatial": some})
+        assert ("column pattern" in named(long_dark=dark)) is is_seen
+    # levels of two frames, four degrees of freedom: χ² has a chance of 1e-4 above 23.51
+    limit = np.sqrt((9.4 / (14 * 22) + 0.62 / 14 + 0.04 / 22) / 2 * 23.5127 / 4)
     black = vars(calibration().black)
-    for factor in (0.99, 1.01):
+    for factor in (0.999, 1.001):
         changed = SimpleNamespace(**{**black, "rms": factor * limit})
         assert ("black level" in named(black=changed)) is (factor > 1)
+    # signal of the long series at 250 photons: errors of dark levels, curve, light, and of what 16 frames share
+    expected = 0.22 * 252 * 1.0021
+    shared = (0.12 + 0.33) / 14 + (0.05 + 0.21) / 22 + 0.02 + 0.11
+    level = np.sqrt(2 * 0.002**2 + 0.03**2 + shared / 16)
+    limit = 3.9 * np.hypot(level / expected, 4e-4)
+    lit = vars(calibration().long_lit)
+    for more in (0.99, 1.01, -0.99, -1.01):
+        changed = SimpleNamespace(**{**lit, "mean": np.full((14, 22), 40 + expected * (1 + more * limit))})
+        assert ("light of the long series" in named(long_lit=changed)) is (abs(more) > 1)
+    other = SimpleNamespace(**{**vars(calibration().pairs), "spatial_lit": SimpleNamespace(photons=301.0)})
+    assert "light of the long series" not in named(pairs=other)  # beyond the brightest clear level
 
 
 def test_histograms_of_noise_are_densities_beside_that_of_their_law():

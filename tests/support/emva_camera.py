@@ -31,6 +31,9 @@ class Camera:
     correlation: float = 0.0  # of the read noise of neighbours in a row
     full_well: float = np.inf  # e-
     hum: float = 0.0  # DN, of a checkerboard with a new phase in each frame
+    hot: int = 0  # pixels of many times the dark current
+    softness: float = 0.0  # e-, over which the full well is reached
+    light_drift: float = 0.0  # relative, from no exposure to the longest; long series after it
     exposures_us: tuple[float, ...] = tuple(float(t) for t in np.linspace(400, 24_000, 18).round())
     long_us: float = 11_400.0
     long_frames: int = 12
@@ -49,14 +52,22 @@ class Camera:
 
         offset = self.black + self.gain * pattern(self.dsnu)
         response = 1 + pattern(self.prnu)
+        currents = np.full(shape, self.dark_current)
+        own = np.random.default_rng([seed, 1])
+        currents.flat[own.integers(0, currents.size, self.hot)] *= own.uniform(20, 200, self.hot)
+        longest = max(self.exposures_us)
         grid = np.add.outer(np.arange(self.rows), np.arange(self.cols))
 
         def frame(lit, exposure_us, photons_per_us):
             light = 0.0
             if lit:
                 light = self.efficiency * photons_per_us * (exposure_us + self.late_us) * response
-                light = light * (1 + self.light_scatter * rng.standard_normal())
-            electrons = rng.poisson(light + self.dark_current * exposure_us * 1e-6 + np.zeros(shape))
+                late = 1.0 if exposure_us == self.long_us else exposure_us / longest
+                light = light * (1 + self.light_scatter * rng.standard_normal()) * (1 + self.light_drift * late)
+            electrons = rng.poisson(light + currents * exposure_us * 1e-6)
+            if self.softness:
+                left = self.full_well - electrons
+                electrons = self.full_well - self.softness * np.logaddexp(0, left / self.softness)
             signal = self.gain * np.minimum(electrons, self.full_well)
             signal = signal * (1 + self.bend * signal / (2**self.bits - 1))
             noise = rng.standard_normal((self.rows, self.cols + 1))

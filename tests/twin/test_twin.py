@@ -100,6 +100,7 @@ def test_the_command_tells_each_check_and_its_status(captures, tmp_path):
     assert result.exit_code == 0, result.output
     facts = json.loads(result.stdout)
     assert facts["passed"] and len(facts["checks"]) == 20
+    assert {"linearity", "interference"} <= {finding["check"] for finding in facts["findings"]}
     with pytest.raises(OutputError, match="exists"):
         make_twin(captures, out)
 
@@ -109,6 +110,17 @@ def test_a_series_too_short_for_two_halves_is_refused(tmp_path):
     with pytest.raises(SpecError, match="a series of fewer than 8 frames has no two halves"):
         make_twin(folder, tmp_path / "out")
     assert not (tmp_path / "out").exists() and [p.name for p in tmp_path.iterdir()] == ["short"]
+
+
+def test_too_few_pairs_for_two_halves_are_refused(tmp_path):
+    """Nine are the fewest; of more, every second one may saturate where all of them are enough."""
+    few = CAMERA.but(rows=24, cols=30, exposures_us=tuple(np.linspace(500.0, 4000, 8))).write(tmp_path / "few", 1)
+    with pytest.raises(SpecError, match="8 lit pairs; a twin is fitted to every second one, and 9 are the fewest"):
+        make_twin(few, tmp_path / "out")
+    bright = CAMERA.but(rows=24, cols=30, exposures_us=tuple(np.linspace(3000.0, 30_000, 12))).write(tmp_path / "b", 1)
+    evaluate(read_pair_set(bright))
+    with pytest.raises(SpecError, match="only 4 of 6 lit exposures, of every second one, are clear of saturation, and"):
+        make_twin(bright, tmp_path / "out")
 
 
 @pytest.mark.slow
@@ -325,7 +337,9 @@ def test_spatial_checks_are_relative_to_each_ones_own_signal(monkeypatch):
     monkeypatch.setattr(comparison, "without_lines", lambda series, _: series)
     monkeypatch.setattr(comparison, "without_defects", lambda series, defects: series)
     monkeypatch.setattr(comparison, "spectra", spectra)
-    result = SimpleNamespace(lit=None, dark=None, long_dark=own.long_dark, long_lit=own.long_lit, noise_spectrum=None, defects=None)
+    result = SimpleNamespace(
+        lit=None, dark=None, long_dark=own.long_dark, long_lit=own.long_lit, noise_spectrum=None, defects=None
+    )
     found = {check.name: check for check in comparison._spatial(result, real, twin)}
     signal = [h.long_lit.mean.mean() - h.long_dark.mean.mean() for h in (real, twin, own)]
     assert powers == pytest.approx([1, 1, 1, *signal])
@@ -434,3 +448,6 @@ def test_the_page_counts_the_statistics_that_pass():
     text = page.page(checks, ["a bend"])
     assert re.search(r"\b2\s+of\s+3\s+statistics\s+pass", text) and text.count("<svg") == 2 and "a bend" in text
     assert [page.check_line(one)[:4] for one in checks] == ["pass", "pass", "FAIL"]
+    assert ", at exposure 5 s; rms" in page.check_line(checks[0])
+    checks[0].place = "photons per pixel"
+    assert ", at 5 photons per pixel; rms" in page.check_line(checks[0])

@@ -25,11 +25,7 @@ from hesim_render.calibrate.aps.light_curve import (
 from hesim_render.calibrate.aps.long_series import Long, long_series
 from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
 from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, Levels, pair_levels
-from hesim_render.calibrate.aps.spatial import (
-    Pattern,
-    outliers,
-    pattern_of,
-)
+from hesim_render.calibrate.aps.spatial import Pattern, outliers, pattern_of
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance
 from hesim_render.calibrate.moments import Progress
 from hesim_render.core.errors import SpecError
@@ -158,9 +154,10 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     clear = lit.clear & (np.arange(signal.size) < saturation) & (signal > 0)
     if clear.sum() < _FEWEST_CLEAR:
         last = pairs.lit[min(int(clear.sum()), signal.size - 1)]
+        half = ", of every second one," if pairs.halved else ""
         raise last.error(
-            f"saturated from here on: only {int(clear.sum())} of {signal.size} lit exposures are clear of saturation; "
-            "capture shorter exposures or less light"
+            f"saturated from here on: only {int(clear.sum())} of {signal.size} lit exposures{half} are clear of "
+            f"saturation, and {_FEWEST_CLEAR} are the fewest; capture shorter exposures or less light"
         )
     if light[clear].min() == light[clear].max():
         raise pairs.lit[0].error("all lit pairs have one light; EMVA 1288 needs many, up to saturation")
@@ -294,12 +291,14 @@ def _bins(
 def _variance_fit(bins: Pooled) -> VarianceFit:
     """The polynomial in 1, I, t and I²: one light at many exposures, or many at one, tells no more.
 
-    Where dark current makes no visible noise, the term in t is left out too: its sign would be chance.
+    Where dark current makes no visible noise, the term in t is left out too: its sign would be chance. Dark variances
+    above the standard's limit are all used: levels in the light alone would tell the constant badly.
     """
-    fit = fit_variance(bins, _NO_TERMS)
+    least = _LEAST_DARK_DN2 - ADC_VARIANCE_DN2
+    fit = fit_variance(bins, _NO_TERMS, least)
     if fit.beta[2] > 2 * np.sqrt(fit.covariance[2, 2]):
         return fit
-    return fit_variance(bins, (2, *_NO_TERMS))
+    return fit_variance(bins, (2, *_NO_TERMS), least)
 
 
 def _scatter(

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import chi2 as chi2_law
 
 from hesim_render.calibrate.aps.pairs import PairCalibration
 from hesim_render.calibrate.estimate import ALARM, Finding
+from hesim_render.recording.pair_set import light_of_series
 
 #: Relative changes of signal and variance from which a finding names them.
 _LEAST_BEND, _LEAST_SCATTER = 2e-3, 2e-3
+#: Change of the dark level from which a finding names it, DN.
+_LEAST_LEVEL_DN = 0.01
 #: Standard errors that chance exceeds in one of 10,000 cases.
 SIGNIFICANT = 3.9
 
@@ -22,7 +26,8 @@ def findings(result: PairCalibration) -> list[Finding]:
     if curve.bends and abs(bend) > _LEAST_BEND:
         text = (
             f"the mean bends: {100 * bend:+.2g} % at the brightest clear level. The sensor file has the curve "
-            "(aps.nonlinearity); K and the quantum efficiency are means over 0 to 70 % of saturation"
+            "(aps.nonlinearity); K and the quantum efficiency are means over 0 to 70 % of saturation. Light that "
+            "drifts while the exposures get longer looks the same; exposures in random order tell them apart"
         )
         outcome.append(("linearity", text))
     if abs(curve.offset) > 4 * curve.offset_error > 0:
@@ -34,6 +39,7 @@ def findings(result: PairCalibration) -> list[Finding]:
         outcome.append(("light offset", text))
     if curve.light_rms > _LEAST_SCATTER / 4:
         outcome.append(("light", f"the light scatters by {100 * curve.light_rms:.2g} % from exposure to exposure"))
+    outcome += _of_the_long_series(result)
     if result.level_rms > _LEAST_SCATTER and result.level_chance < ALARM:
         text = (
             f"the variances of single levels scatter by {100 * result.level_rms:.2g} % about the polynomial, more than "
@@ -60,12 +66,47 @@ def findings(result: PairCalibration) -> list[Finding]:
     columns = result.long_dark.spatial.col
     if columns > SIGNIFICANT * result.long_dark.spatial.errors(fixed=True)[1]:
         outcome.append(("column pattern", f"columns have offsets of their own, {np.sqrt(columns):.2g} DN rms"))
-    if result.black.rms > 3 * np.sqrt(max(result.row[0], 0.0) / (2 * result.pairs.shape[0])) + 0.01:
-        outcome.append(
-            ("black level", f"the dark level changes by {result.black.rms:.2g} DN from exposure to exposure")
-        )
+    level = _level_change(result)
+    if level > _LEAST_LEVEL_DN:
+        outcome.append(("black level", f"the dark level changes by {level:.2g} DN from exposure to exposure"))
     outcome += _of_the_set(result)
     return [Finding(check, text, None) for check, text in outcome]
+
+
+def _level_change(result: PairCalibration) -> float:
+    """Scatter of the dark levels about their line, DN, beyond that of the noise; 0 where chance makes as much."""
+    rows, cols = result.pairs.shape
+    noise = result.long_dark.temporal.pixel / (rows * cols) + sum(
+        max(value, 0.0) / count for (value, _), count in ((result.row, rows), (result.col, cols))
+    )
+    noise /= 2  # of two frames
+    freedom = max(result.black.groups - 1, 1)
+    if result.black.rms**2 < noise * chi2_law.isf(ALARM, freedom) / freedom:
+        return 0.0
+    return float(np.sqrt(result.black.rms**2 - noise))
+
+
+def _of_the_long_series(result: PairCalibration) -> list[tuple[str, str]]:
+    """Light of the long series that is not that of the pairs: those are taken one after the other, this at once."""
+    light = light_of_series(result.pairs.spatial_lit, result.pairs.has_photons)
+    if not result.light[result.clear].min() <= light <= result.light[result.clear].max():
+        return []
+    here, curve = np.array([light]), result.curve
+    expected = float(curve.at(here)[0])
+    more = float(result.long_lit.mean.mean() - result.long_dark.mean.mean()) / expected - 1
+    temporal = result.long_lit.temporal, result.long_dark.temporal
+    shared = sum(
+        max(t.row, 0.0) / result.pairs.shape[0] + max(t.col, 0.0) / result.pairs.shape[1] + max(t.frame, 0.0)
+        for t in temporal
+    ) / result.long_lit.frames  # fmt: skip
+    level = np.sqrt(2 * result.black.rms**2 + float(curve.error(here)[0]) ** 2 + shared)
+    if abs(more) < max(_LEAST_SCATTER / 2, SIGNIFICANT * float(np.hypot(level / expected, curve.light_rms))):
+        return []
+    text = (
+        f"the long series has {100 * abs(more):.2g} % {'more' if more > 0 else 'less'} light than the pairs around its "
+        "exposure: the light drifts from one capture to the next"
+    )
+    return [("light of the long series", text)]
 
 
 def _of_the_set(result: PairCalibration) -> list[tuple[str, str]]:

@@ -183,7 +183,7 @@ class VarianceFit:
     quantised_pixels: int
 
 
-def fit_variance(bins: Pooled, without: Sequence[int] = ()) -> VarianceFit:
+def fit_variance(bins: Pooled, without: Sequence[int] = (), least_dn2: float = QUANTISED_VARIANCE_DN2) -> VarianceFit:
     """Iteratively reweighted least squares, corrected for the noise of the signal.
 
     A signal estimated with error variance τ² inflates Σ I², Σ I³ and Σ I⁴ by known amounts (corrected
@@ -194,10 +194,10 @@ def fit_variance(bins: Pooled, without: Sequence[int] = ()) -> VarianceFit:
     ----------
     bins : pooled variances.
     without : numbers of terms that are not fitted.
+    least_dn2 : variance, without that of the ADC, below which rounding hides it, so that it tells nothing.
     """
     everything = bins.pixels.sum()
-    # rounding hides smaller variances: a sample variance then tells nothing
-    seen = bins.variance_dn2 >= QUANTISED_VARIANCE_DN2
+    seen = bins.variance_dn2 >= least_dn2
     bins = Pooled(*(getattr(bins, name)[seen] for name in Pooled.__dataclass_fields__))
     if bins.pixels.size == 0:
         nothing = np.zeros(6)

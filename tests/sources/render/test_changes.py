@@ -197,18 +197,22 @@ def test_the_documented_constants_are_those_of_the_code():
 
 
 @pytest.mark.parametrize("share", [1, 9])
-def test_a_forecast_looks_at_twelve_squares_of_as_many_pixels_whatever_their_density(share):
-    """Sides of 12 px where all pixels count, and of 36 px where one in nine does, around pixels drawn at random."""
-    rows, cols = 90, 120
+def test_a_forecast_looks_at_small_squares_of_as_many_pixels_whatever_their_density(share):
+    """Sides of 4 px where all pixels count, and of 12 px where one in nine does, around one pixel of each of 192 parts
+    of the list; single pixels where these have no neighbours.
+    """
+    rows, cols = 190, 220
     pixel = np.sort(np.random.default_rng(1).permutation(rows * cols)[: rows * cols // share]).astype(np.uint32)
-    source = SimpleNamespace(sensor=SimpleNamespace(rows=rows, cols=cols))
-    found = forecast._patches(pixel, source, np.random.default_rng(2))
-    reach = 6 * np.sqrt(share)
-    wanted = set()
-    for centre in np.random.default_rng(2).choice(pixel.size, 12):
-        at = divmod(int(pixel[centre]), cols)
-        for one in pixel.tolist():
-            place = divmod(one, cols)
-            if abs(place[0] - at[0]) <= reach and abs(place[1] - at[1]) <= reach:
-                wanted.add(one)
-    assert found.tolist() == sorted(wanted)
+    source = SimpleNamespace(sensor=SimpleNamespace(rows=rows, cols=cols), is_apart=lambda role: role == "any")
+    found = forecast._sample(pixel, source, "events", np.random.default_rng(2))
+    reach, row, col = 2 * np.sqrt(share), pixel.astype(int) // cols, pixel.astype(int) % cols
+    wanted = np.zeros(pixel.size, bool)
+    for number, part in enumerate(np.random.default_rng(2).random(192)):
+        at = int((number + part) * pixel.size / 192)
+        wanted |= (abs(row - row[at]) <= reach) & (abs(col - col[at]) <= reach)
+    assert found.tolist() == pixel[wanted].tolist()
+    single = forecast._sample(pixel, source, "any", np.random.default_rng(2))
+    assert single.size == min(4096, pixel.size) and np.isin(single, pixel).all() and (np.diff(single) > 0).all()
+    # of each part of the list one
+    part = np.searchsorted(pixel, single) * (single.size / pixel.size)
+    assert (part.astype(int) == np.arange(single.size)).all()
