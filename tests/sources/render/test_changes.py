@@ -212,7 +212,7 @@ def test_a_forecast_looks_at_small_squares_of_as_many_pixels_whatever_their_dens
         wanted |= (abs(row - row[at]) <= reach) & (abs(col - col[at]) <= reach)
     assert found.tolist() == pixel[wanted].tolist()
     single = forecast._sample(pixel, source, "any", np.random.default_rng(2))
-    assert single.size == min(4096, pixel.size) and np.isin(single, pixel).all() and (np.diff(single) > 0).all()
-    # of each part of the list one
-    part = np.searchsorted(pixel, single) * (single.size / pixel.size)
-    assert (part.astype(int) == np.arange(single.size)).all()
+    place = np.searchsorted(pixel, single)
+    assert 0.85 * 4096 < single.size <= 4096 and (pixel[place] == single).all()
+    # no part of the list is left out, and none is taken twice
+    assert (np.diff(place) > 0).all() and np.diff(place).max() < 2 * pixel.size / 4096 + 1

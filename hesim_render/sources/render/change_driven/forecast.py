@@ -22,7 +22,7 @@ _SINGLE = 4096
 #: Memory of the program with its kernels, per event pixel and window of a block, and per event pixel and frame pixel
 #: of the stages, bytes.
 _BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 14, 110, 60
-#: Time of plans, statistics and copies for each ray, on top of that of tracing it, s: of `rotating-star` on `davis346` and
+#: Time of plans, statistics and copies for each ray, beside that of tracing it, s: of `rotating-star` on `davis346` and
 #: `eiger` and `camera-sweep` on `gen2`, 0.02 s each, on two threads of an AVX-512 server.
 _BESIDE_S = 33e-9
 
@@ -91,7 +91,7 @@ def _sample(
     is_apart = source.is_apart(role)
     count = min(_SINGLE if is_apart else _PATCHES, pixel.size)
     # one of each part of the list, so that all rows are seen
-    chosen = ((np.arange(count) + rng.random(count)) * (pixel.size / count)).astype(np.int64)
+    chosen = np.unique(((np.arange(count) + rng.random(count)) * (pixel.size / count)).astype(np.int64))
     if is_apart:
         return pixel[chosen]
     row, col = np.divmod(pixel.astype(np.int64), source.sensor.cols)
