@@ -269,8 +269,8 @@ def test_rays_follow_from_what_the_decision_rays_saw():
 
 
 def test_pairs_of_low_contrast_take_the_rays_of_their_own_scatter():
-    """Contrasts of 15 and 17 wanted errors: (0.68·(7.5 + 1))^(1/0.7) = 12 rays, but an eighth of the law at least, which
-    gives 17 its rays.
+    """Contrasts of 15 and 17 wanted errors: (0.68·(7.5 + 1))^(1/0.7) = 12 rays, but an eighth of the law at least,
+    which gives 17 its rays.
     """
     contrast, scatter = np.array([15.0, 17.0, 15.0]), np.array([1.0, 1.0, 30.0])
     fit = EdgeFit(*(np.asarray(v, np.float32) for v in (
