@@ -100,10 +100,10 @@ def make_twin(
             bench.long(held, True),
         )  # fmt: skip
         checks = compare(result, held, real, twin)
-        found = findings(result)
+        own_findings = findings(result)
         (folder.path / RESULT_NAME).write_text(_json(checks, seed), encoding="utf-8")
-        (folder.path / "twin.html").write_text(page(checks, [finding.text for finding in found]), encoding="utf-8")
-    return Twin(folder.target, checks, found)
+        (folder.path / "twin.html").write_text(page(checks, [finding.text for finding in own_findings]), encoding="utf-8")
+    return Twin(folder.target, checks, own_findings)
 
 
 def _json(checks: list[Check], seed: int) -> str:
