@@ -102,7 +102,8 @@ def make_twin(
         checks = compare(result, held, real, twin)
         own_findings = findings(result)
         (folder.path / RESULT_NAME).write_text(_json(checks, seed), encoding="utf-8")
-        (folder.path / "twin.html").write_text(page(checks, [finding.text for finding in own_findings]), encoding="utf-8")
+        texts = [finding.text for finding in own_findings]
+        (folder.path / "twin.html").write_text(page(checks, texts), encoding="utf-8")
     return Twin(folder.target, checks, own_findings)
 
 
