@@ -61,13 +61,17 @@ class _Audit(_OpenSection):
     verdict: Literal["met", "not shown", "not met"]
     quality_needed: float | None = None
     samples_needed: int | None = None
+    short_of_rays: float | None = None
     events: _AuditedPart | None = None
     frames: _AuditedPart | None = None
 
     @model_validator(mode="after")
     def _check(self) -> _Audit:
-        if self.verdict == "not met" and self.quality_needed is None and self.samples_needed is None:
-            raise ValueError("quality_needed or samples_needed is required where the verdict is 'not met'")
+        reasons = self.quality_needed, self.samples_needed, self.short_of_rays
+        if self.verdict == "not met" and all(reason is None for reason in reasons):
+            raise ValueError(
+                "quality_needed, samples_needed or short_of_rays is required where the verdict is 'not met'"
+            )
         return self
 
 

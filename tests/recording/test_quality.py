@@ -96,3 +96,22 @@ def test_verdicts_of_many_runs_are_counted():
         "NOT MET: 2 of 2 clips are worse than asked for (a, b); 90 samples would do"
     ]
     assert is_short_of_wish(exact) and not is_short_of_wish(met) and not is_short_of_wish(None)
+
+
+def test_a_run_whose_values_have_the_most_rays_names_no_quality():
+    capped = {"verdict": "not met", "quality_needed": None, "short_of_rays": 0.313}
+    part = {"deviation_noise": {"rms": 4.3}, **SHARES}
+    audit = {"frames": part, "tolerance_noise": 1.5, **capped}
+    error = {"frames": {"rms": 0.29, "p95": 0.6, "p99": 0.8}}
+    (line,) = (
+        line for line in render_lines({"error_noise": error, "quality": 0.5, "audit": audit}) if "NOT MET" in line
+    )
+    assert line.endswith(
+        "the most rays that a value may have are too few for 31 % of the values, so no --quality would do; the exact "
+        "mode (--samples) has no such limit"
+    )
+    many = {"a": capped, "b": {"verdict": "not met", "quality_needed": 0.3}, "c": capped, "d": {"verdict": "met"}}
+    (line,) = verdict_lines(many, "clips")
+    assert line.endswith(
+        "quality 0.3 would do; no quality would do for 2, whose values have the most rays that they may have"
+    )

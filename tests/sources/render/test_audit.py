@@ -307,14 +307,15 @@ def test_the_verdict_is_that_of_the_worst_share():
     judge = Audit(None, None, 0.4, None, np.arange(3), 1)._verdict
 
     def part(off=0.0, bound=0.02, p99=0.8, **events):
-        return {"off": off, "off_at_most": bound, "off_wanted_at_most": 0.02, "deviation_noise": {"p99": p99}, **events}
+        shares = {"off": off, "off_at_most": bound, "off_wanted_at_most": 0.02, "short_of_rays": 0.01}
+        return shares | {"deviation_noise": {"p99": p99}} | events
 
     def of_events(name, share, bound, limit):
         return {f"{name}": share, f"{name}_at_most": bound, f"{name}_wanted_at_most": limit}
 
     fine = {"true_events": 3.0, "found_events": 2.0} | of_events("missed", 0.0, 0.02, 0.02)
     fine |= of_events("extra", 0.0, 0.01, 0.01)
-    assert judge([part(**fine), part()]) == {"verdict": "met", "quality_needed": None}
+    assert judge([part(**fine), part()]) == {"verdict": "met", "quality_needed": None, "short_of_rays": None}
     assert judge([part(**fine), part(bound=0.0201)])["verdict"] == "not shown"
     assert judge([part(off=0.02, bound=0.02)])["verdict"] == "met"
     for worse in ({"missed": 0.021}, {"extra": 0.011}, {"off": 0.021}):
@@ -525,3 +526,37 @@ def test_a_change_of_exactly_the_threshold_is_no_event_of_pixels_with_ticks():
     counted = compare_ticks(signal, signal, np.full(signal.shape, 0.01), theta, np.ones(4, np.bool_))
     np.testing.assert_array_equal(counted.true, [0, 2, 0])
     np.testing.assert_array_equal(counted.in_run, [0, 2, 0])
+
+
+class Stated(Given):
+    """A fifth of the pixels states an error of 1.2 of the noise, the others of 0.9: wanted is 0.5."""
+
+    def flux_of_blocks(self, pixel, blocks):
+        for sample in super().flux_of_blocks(pixel, blocks):
+            stated = UNIT * self.run[0] * np.where(np.arange(self.run.shape[1]) % 5 == 0, 1.2, 0.9)
+            yield Sample(sample.half_a, sample.half_b, stated[pixel].astype(np.float32))
+
+
+def test_values_whose_stated_error_is_far_above_the_wanted_one_are_short_of_rays(monkeypatch):
+    monkeypatch.setattr(audit_module, "_RAYS", 10**9)
+    truth = np.full((TICKS, ROWS * COLS), 1e5)
+    sensor, source = sensor_of(), Stated(truth, truth)
+    pixels = sensor.layout.evs_pixel.ravel()
+    noted = NotedFlux(source, pixels, TICKS, 1, *STRETCHES["previous_sample"], 2)
+    for _ in noted.flux_of_blocks(pixels, tick_blocks(sensor.spec.evs, 0, TICKS * TICK_US)):
+        pass
+    report = Audit(noted, source, QUALITY, sensor.evs, pixels, 2).run()
+    assert report["events"]["short_of_rays"] == pytest.approx(0.2, abs=0.05)
+    assert report["verdict"] != "not met" and report["short_of_rays"] is None
+
+
+@pytest.mark.parametrize(("p99", "short", "quality", "told"), [
+    (2.1, 0.31, 0.35, None),  # at most 0.7 of today's, for which a value may have more rays
+    (9.3, 0.31, None, 0.31),  # 0.08 would be needed, which has no more rays than 0.25
+    (9.3, 0.013, 0.08, None),  # off for other reasons
+])  # fmt: skip
+def test_no_quality_is_named_where_values_have_the_most_rays(p99, short, quality, told):
+    part = {"off": 0.4, "off_at_most": 0.5, "off_wanted_at_most": 0.02, "short_of_rays": short}
+    audit = Audit(None, None, QUALITY, None, np.arange(3), 1)
+    verdict = audit._verdict([part | {"deviation_noise": {"p99": p99}}])
+    assert verdict == {"verdict": "not met", "quality_needed": pytest.approx(quality), "short_of_rays": told}

@@ -2,16 +2,18 @@
 
 import inspect
 import re
-from dataclasses import FrozenInstanceError, asdict, fields
+from dataclasses import FrozenInstanceError, asdict, fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import hesim_render as hr
 from hesim_render.sources.render.change_driven import forecast
 from hesim_render.sources.render.change_driven.allocation import allocate
 from hesim_render.sources.render.change_driven.differences import Differences
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
 from hesim_render.sources.render.change_driven.pilot import Pilot, Refinement
 from hesim_render.sources.render.change_driven.plan import Plan, changes, longer, plan
@@ -194,6 +196,19 @@ def test_the_documented_constants_are_those_of_the_code():
     page = Path(__file__).parents[3] / "docs" / "change-driven-rendering.md"
     table = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page.read_text(encoding="utf-8"), re.MULTILINE)
     assert dict(table) == {name: str(value) for name, value in asdict(TUNING).items()}
+
+
+@pytest.mark.parametrize(
+    ("quality", "most"),
+    [(2.0, 4096), (0.5, 4096), (0.45, 8192), (0.36, 8192), (0.3, 16384), (0.25, 16384), (0.03, 16384)],
+)
+def test_a_better_quality_moves_the_largest_number_of_rays(quality, most):
+    assert TUNING.at(quality) == replace(TUNING, most_rays=most)
+    sensor = hr.load_sensor("davis346").crop(7, 5)
+    source = ChangeDrivenFlux(hr.load_scene("flat-field"), sensor, quality, 3)
+    assert source._renderer.tuning.most_rays == most
+    own = replace(TUNING, most_rays=40_000)
+    assert own.at(quality).most_rays == 40_000  # never fewer than given
 
 
 @pytest.mark.parametrize("share", [1, 9])

@@ -17,6 +17,8 @@ from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.isp.develop import _illumination
 from hesim_render.mosaic.schedule import CELL_US
 from hesim_render.sources.render.camera import place_camera
+from hesim_render.sources.render.change_driven.estimates import Flux
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer, Windows
 from hesim_render.sources.render.change_driven.sample_instants import STEP_PX, MotionClock
 from hesim_render.sources.render.exact import RenderedFlux, used_responses
@@ -147,6 +149,24 @@ CLOSED = {
     "walls": {"type": "sphere", "radius": 4.0, "flip_normals": True, "bsdf": WHITE},
     "lamp": {**LAMP, "bsdf": WHITE},
 }
+
+
+def test_a_pixel_in_which_no_ray_saw_light_states_the_error_that_is_wanted():
+    """A floor that reflects nothing shows nothing, yet its rays do not prove that no light comes from there."""
+    black = {"type": "diffuse", "reflectance": even(0.0)}
+    shapes = {"floor": {**FLOOR, "bsdf": black}, "lamp": LAMP, "ball": {**BALL, "bsdf": {"type": "plastic"}}}
+    sensor, quality = hr.load_sensor("davis346").crop(COLS, ROWS), 0.7
+    source = ChangeDrivenFlux(mitsuba_scene(shapes), sensor, quality, 3)
+    pixel = sensor.layout.evs_pixel.ravel()
+    out = Flux.zeros(1, pixel.size)
+    begin = np.full(pixel.size, 100.0)
+    source._renderer.alone(pixel, begin, begin + 1, "events", out)
+    half, dark = 0.5 * np.abs(out.half_a - out.half_b)[0], (out.half_a + out.half_b)[0] == 0
+    assert 120 < dark.sum() < 180
+    wanted = quality * source.noise_unit(pixel, np.zeros((1, pixel.size)), True)[0]
+    # beside the ball the pilot, which starts rays a little further out, saw light, and more is wanted there
+    assert np.all(half[dark] > 0.999 * wanted[dark]) and np.mean(half[dark] < 1.001 * wanted[dark]) > 0.9
+    assert source.counts.rays >= 64 * pixel.size
 
 
 def furnace(integrator, depth=None):

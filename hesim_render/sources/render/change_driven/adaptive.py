@@ -26,6 +26,8 @@ from hesim_render.sources.render.change_driven.windows import Windows
 #: Pixels that are processed at a time, to bound memory.
 _BAND_PIXELS = 1 << 17
 _ALWAYS_US = (-np.inf, np.inf)
+#: Part of the wanted error below which a flux counts as no light at all.
+_NOTHING = np.float32(1e-3)
 
 
 class AdaptiveRenderer:
@@ -136,7 +138,12 @@ class AdaptiveRenderer:
         """Which pairs of a band are rendered, with how many rays; see `plan`."""
         given = pilot, band.sites, band.unit, band.quality, self.gain, self.tuning
         # windows of synchronous sensors are too far apart for an edge to stay within a pixel
-        return plan(*given, is_knot=is_knot, follows=self.look_stride > 1 and self.tracer.rays.is_box)
+        what = plan(*given, is_knot=is_knot, follows=self.look_stride > 1 and self.tracer.rays.is_box)
+        if not self.tracer.is_diffuse:
+            # a highlight or a caustic may be there all the same
+            dark = what.pilot < _NOTHING * what.wanted
+            what.rays[dark] = np.maximum(what.rays[dark], np.int16(self.tuning.dark_rays))
+        return what
 
     def follow(
         self, band: Band, windows: Windows, numbers: NDArray[np.int64], what: Plan
@@ -199,6 +206,12 @@ class AdaptiveRenderer:
         got = self.tracer.trace(*pairs, rays, what.controlled[todo], span_us=span_us, aims=aims, edges=edges)
         self.counts.rays += self.tracer.rays_done - before
         self.counts.pairs += place.size
+        if not self.tracer.is_diffuse:
+            # rays that saw nothing do not show that there is nothing: halves of 0 would state an error of 0
+            wanted = what.wanted[todo]
+            unseen = np.maximum(np.abs(got.half_a), np.abs(got.half_b)) < _NOTHING * wanted
+            got.half_a[unseen] += wanted[unseen]
+            got.half_b[unseen] -= wanted[unseen]
         out.half_a[todo], out.half_b[todo], met[todo] = got.half_a, got.half_b, got.met
         np.copyto(out.error, what.error)
         if first is not None:

@@ -13,10 +13,14 @@ None was chosen on the random scenes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import ceil, log2
 
 import numpy as np
 from numpy.typing import NDArray
+
+#: Quality for which `Tuning.most_rays` holds, and the one from which on no more rays are given.
+_QUALITY, FINEST_QUALITY = 0.5, 0.25
 
 
 @dataclass(frozen=True)
@@ -66,10 +70,14 @@ class Tuning:
         light of an approaching lamp is interpolated.
     least_rays : rays, C. Least number for a pair: two halves of four. Without: the difference of the halves gives no
         error estimate.
+    dark_rays : rays, C. Least number for a pair of paths in which the pilot saw no light. Without (as few as
+        `least_rays`): highlights and caustics that a pilot misses are missed by the picture too.
     ray_weight : wanted errors, H. Largest contribution of a single ray to a pair. Without: a ray that sees what no
         pilot ray saw (a lamp through a gap) makes a value that is far off, and its stated error with it.
     most_rays : rays, C. Largest number for a pair. Without: one pixel that sees a lamp in a rough mirror takes all the
         time.
+    most_fine_rays : rays, C. The same at a quality of 0.25 or better; from 0.5 to 0.25 it grows as 1/quality². Without
+        (as few as `most_rays`): no quality reaches what 4096 rays do not.
     diffuse_gain, path_gain : (factor, power), no unit, F. The standard error of n stratified rays is factor · n^-power
         times the scatter, for direct light on diffuse surfaces and for paths. Without (1, 0.5): the plan assumes
         independent rays and spends several times as many.
@@ -142,8 +150,10 @@ class Tuning:
     extreme_change: float = 128.0
     extreme_windows: int = 1
     least_rays: int = 8
+    dark_rays: int = 64
     ray_weight: float = 2.0
     most_rays: int = 4096
+    most_fine_rays: int = 16384
     diffuse_gain: tuple[float, float] = (0.68, 0.70)
     path_gain: tuple[float, float] = (0.46, 0.56)
     frame_margin: float = 1.5
@@ -169,6 +179,11 @@ class Tuning:
     audit_ray_weight: float = 0.8
     edge_least_audit_rays: int = 1024
     most_audit_times: int = 8
+
+    def at(self, quality: float) -> Tuning:
+        """The constants for a quality: a better one than 0.5 moves the largest number of rays of a pair."""
+        moved = self.most_rays << ceil(max(0.0, 2 * log2(_QUALITY / quality)))
+        return replace(self, most_rays=max(self.most_rays, min(moved, self.most_fine_rays)))
 
 
 @dataclass(frozen=True)
