@@ -248,3 +248,12 @@ def test_other_folders_and_damaged_runs_are_refused(tmp_path):
     run.write_text("{")
     with pytest.raises(OutputError, match="is damaged"):
         sweep(small, out=tmp_path / "out")
+
+
+def test_a_dry_run_says_how_many_runs_are_missing(tmp_path, capsys):
+    changes = {"vary": {}, "seeds": [5], "roi": "8x8", "metrics": ["electrons"], "duration_s": 0.02}
+    sweep({**BASE, **changes}, out=tmp_path / "out")
+    (tmp_path / "sweep.yaml").write_text(json.dumps({**BASE, **changes, "seeds": [4, 5, 6]}))
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["study", str(tmp_path / "sweep.yaml"), "--out", str(tmp_path / "out"), "--dry-run"])
+    assert stop.value.code == 0 and "3 runs, 2 of them not yet made" in capsys.readouterr().out
