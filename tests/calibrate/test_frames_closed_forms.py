@@ -261,3 +261,42 @@ def test_the_sensor_file_of_captures_has_their_figures(tmp_path, seen, limit):
     result.saturation = 2  # never seen
     data = yaml.safe_load(sensor_file.write_sensor(file, tmp_path / "c.yaml", result).read_text(encoding="utf-8"))
     assert data["aps"]["full_well_e"] == pytest.approx(1.25 * 1023 / 0.4, rel=1e-5)
+
+
+def test_suspects_are_judged_by_the_exposures_that_are_clear_of_both_ends():
+    """χ² over 8 − 1 degrees of freedom of each exposure that counts."""
+    rows, cols, frames, full = 12, 9, 8, 255
+    rng = np.random.default_rng(3)
+    clear = rng.random((3, rows, cols)) < 0.7
+    freedom = 7 * clear.sum(axis=0)
+    beyond = rng.uniform(0.85, 1.15, (rows, cols))
+    # the dark current is zero and every other variance is 5: that is what a good pixel has
+    variance = np.full((3, rows, cols), 5.0)
+    odd = np.zeros((rows, cols), bool)
+    odd[1::3, 1::3] = True
+    limit = chi2.isf(1e-6, np.maximum(freedom, 1))
+    variance[:, odd] = (beyond * limit * 5.0 / np.maximum(freedom, 1))[odd]
+    low = rng.random(clear.shape) < 0.5
+    moments = SimpleNamespace(
+        lowest=np.where(clear | ~low, 1, 0), highest=np.where(clear | low, full - 1, full), variance=variance,
+        mean=np.full((3, rows, cols), 20.0), exposures_s=np.array([0.1, 0.4, 1.2]), frames=frames,
+    )  # fmt: skip
+    used = np.ones((rows, cols), bool)
+    expected = odd & (beyond > 1) & (freedom > 0)
+    assert expected.sum() >= 3 and (odd & (beyond < 1)).sum() >= 2
+    np.testing.assert_array_equal(telegraph._suspects(moments, used, (1, 3), full), expected)
+    used[tuple(np.argwhere(expected)[0])] = False
+    np.testing.assert_array_equal(telegraph._suspects(moments, used, (1, 3), full), expected & used)
+
+
+def test_only_the_most_suspicious_pixels_are_examined(monkeypatch):
+    monkeypatch.setattr(telegraph, "_MOST", 2)
+    shape = 2, 5, 7
+    variance = np.full(shape, 5.0)
+    variance[:, [0, 2, 4], [3, 1, 6]] = 70.0, 90.0, 80.0
+    moments = SimpleNamespace(
+        lowest=np.ones(shape), highest=np.full(shape, 9), variance=variance, mean=np.zeros(shape),
+        exposures_s=np.array([0.1, 0.4]), frames=8,
+    )  # fmt: skip
+    found = telegraph._suspects(moments, np.ones(shape[1:], bool), (1, 1), 255)
+    assert np.argwhere(found).tolist() == [[2, 1], [4, 6]]
