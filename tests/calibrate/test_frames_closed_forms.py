@@ -7,7 +7,7 @@ import pytest
 import yaml
 from scipy.stats import chi2, norm
 
-from hesim_render.calibrate.aps import checks, composite, dark, sensor_file, telegraph
+from hesim_render.calibrate.aps import checks, common_mode, composite, dark, sensor_file, telegraph, variance
 from hesim_render.calibrate.estimate import ALARM
 
 
@@ -300,3 +300,21 @@ def test_only_the_most_suspicious_pixels_are_examined(monkeypatch):
     )  # fmt: skip
     found = telegraph._suspects(moments, np.ones(shape[1:], bool), (1, 1), 255)
     assert np.argwhere(found).tolist() == [[2, 1], [4, 6]]
+
+
+def test_one_row_has_no_row_noise_that_shows():
+    used = np.zeros((4, 6), bool)
+    used[2] = True
+    found = common_mode.row_noise(None, used)
+    assert found == common_mode.Shared(0.0, float("inf"), 1.0, 1.0)
+
+
+def test_variances_that_rounding_hides_fit_nothing():
+    rng = np.random.default_rng(2)
+    bins = variance.Pooled(
+        np.full(3, 0.1), np.zeros(3), np.full((3, 7), 50.0), np.full((3, 4), 4.0), rng.random(3), np.zeros(3),
+        np.full(3, 9.0), np.ones(3, bool),
+    )  # fmt: skip
+    found = variance.fit_variance(bins, least_dn2=0.081)  # 4/50 DN²
+    assert not found.identified.any() and not found.beta.any() and found.covariance.shape == (6, 6)
+    assert found.quantised_pixels == 150 and found.p_value == found.expected_chi2 == 1 and found.dof == 0
