@@ -181,6 +181,8 @@ def test_each_event_has_the_object_that_its_pixel_shows_at_its_time(recorded, tm
         _ = again.event_objects
     (again.path / "truth" / "event_objects.h5").unlink()
     np.testing.assert_array_equal(hr.Recording.load(again.path).event_objects, found)  # from the scene
+    part = hr.Recording.load(again.path).labelled_slice(0, int(events["t_us"][9]))
+    np.testing.assert_array_equal(part["object"], found[: part.size])
 
 
 def test_a_slice_has_the_cause_and_the_object_of_each_event(recorded, tmp_path, monkeypatch):

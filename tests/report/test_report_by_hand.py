@@ -9,11 +9,12 @@ from matplotlib.figure import Figure
 from scipy import special
 from scipy.stats import norm
 
-from hesim_render.core.errors import SpecError
-from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, s_curves
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, s_curves, simulate
 from hesim_render.report.bench import EventBench
 from hesim_render.report.estimates import crossing, log_estimated, mean_error, quantile, whole_us_quantile
 from hesim_render.report.latency import Answers
+from hesim_render.report.s_curves import SCurve
 from hesim_render.report.steady import Background, _rate, doubling
 
 Z = 1.959963984540054
@@ -385,3 +386,69 @@ def test_what_an_s_curve_lacks_is_said():
     steep = s_curves._problem(size, np.array([0.01, 0.02, 0.96, 0.98]), 20)
     assert steep and "0.2" in steep and "0.3" in steep
     assert s_curves._problem(size, np.array([0.01, 0.04, 0.96, 0.98]), 20) == ""
+
+
+def test_chance_is_the_share_of_windows_of_still_light_with_an_event():
+    """Windows of 100 µs from the begin on, a last part of one left out; pixels that are not good do not count."""
+    times, x, y, on = np.array([
+        (50, 0, 0, 1), (110, 1, 0, 1), (115, 1, 0, 1), (160, 1, 0, 0), (249, 2, 1, 1), (250, 0, 1, 1), (349, 0, 1, 1),
+        (350, 2, 0, 1), (370, 2, 0, 1),
+    ]).T  # fmt: skip
+    events = np.zeros(times.size, [("t_us", "i8"), ("x", "u2"), ("y", "u2"), ("polarity", "i1")])
+    events["t_us"], events["x"], events["y"], events["polarity"] = times, x, y, 2 * on - 1
+
+    class Stream(list):
+        def span_us(self):
+            return 50, 390
+
+    bench = SimpleNamespace(stream=lambda file: Stream([events[:4], events[4:]]), pixels=6, shape=(2, 3))
+    good = np.array([1, 1, 1, 1, 0, 1], bool)
+    steady = SimpleNamespace(file="a")
+    # three windows of five pixels: (0, 0) and (0, 1) in the first, (1, 2) in the second, (1, 0) in the third
+    assert limits.false_share(bench, steady, 100, 0, good) == pytest.approx(4 / 15)
+    assert limits.false_share(bench, steady, 100, 1, good) == pytest.approx(1 / 15)
+    good[0] = False
+    assert limits.false_share(bench, steady, 100, 0, good) == pytest.approx(3 / 12)
+    assert np.isnan(limits.false_share(bench, steady, 341, 0, good))
+
+
+def test_an_s_curve_goes_from_chance_to_one():
+    curve = SCurve(9.0, None, None, None, 0.1, {}, 0.3, 0.05, 40)
+    np.testing.assert_allclose(curve.at(np.array([-9.0, 0.3, 0.35, 9.0])), [0.1, 0.55, 0.1 + 0.9 * norm.cdf(1), 1])
+
+
+@pytest.mark.parametrize(("events", "frames"), [(True, True), (True, False), (False, True), (False, False)])
+def test_captures_are_simulated_of_the_kinds_of_pixels_that_a_sensor_has(events, frames, monkeypatch, tmp_path):
+    """Nine tenths of the progress are those of events, where there are both."""
+    shown = []
+
+    def instrument(kind):
+        def made(sensor, folder, seed, progress):
+            progress(kind, 0.5)
+            assert folder == tmp_path / kind and seed == 7 and (folder.is_dir() or kind == "frames")
+            return SimpleNamespace(record=lambda: (kind, sensor))
+
+        return made
+
+    spec = SimpleNamespace(
+        evs=events or None, aps=frames or None, evs_grid=SimpleNamespace(rows_per_tile=1, cols_per_tile=2)
+    )
+    layout = SimpleNamespace(tile_shape=(2, 6), shape=(31, 47))
+    sensor = SimpleNamespace(spec=spec, name="mine", layout=layout, crop=lambda cols, rows: (cols, rows))
+    monkeypatch.setattr(simulate, "load_sensor", lambda name: sensor)
+    monkeypatch.setattr(simulate, "Instrument", instrument("events"))
+    monkeypatch.setattr(simulate, "FrameInstrument", instrument("frames"))
+    paths = tmp_path / "events", tmp_path / "frames"
+    given = ("s", *paths, (7, 9), 7, lambda what, part: shown.append((what, part)))
+    if not (events or frames):
+        with pytest.raises(RangeError, match="a sensor with frame or event pixels"):
+            simulate.simulate_captures(*given)
+        return
+    made = simulate.simulate_captures(*given)
+    # 7 rows of pixels of one a tile of 2 rows, 9 columns of two a tile of 6; frame pixels in whole tiles
+    assert made == (("events", (30, 14)) if events else None, ("frames", (42, 14)) if frames else None, "mine")
+    parts = {"events": 0.45 if frames else 0.5, "frames": 0.95 if events else 0.5}
+    kinds = [kind for kind, there in (("events", events), ("frames", frames)) if there]
+    assert shown == [(kind, pytest.approx(parts[kind])) for kind in kinds]
+    # a sensor smaller than that is taken whole, without the rest of a tile
+    assert simulate._region(sensor, (90, 90), (1, 2)) == (42, 30)
