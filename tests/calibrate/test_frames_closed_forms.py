@@ -318,3 +318,10 @@ def test_variances_that_rounding_hides_fit_nothing():
     found = variance.fit_variance(bins, least_dn2=0.081)  # 4/50 DN²
     assert not found.identified.any() and not found.beta.any() and found.covariance.shape == (6, 6)
     assert found.quantised_pixels == 150 and found.p_value == found.expected_chi2 == 1 and found.dof == 0
+
+
+def test_sensors_without_event_pixels_have_no_signal_at_them():
+    sensor = SimpleNamespace(tile_rows=["ab"], evs_grid=None)
+    rate = SimpleNamespace(rate_dn_per_s=np.ones((4, 4)), standard_error_dn_per_s=np.ones((4, 4)))
+    signal, uneven = composite.signal_at_event_pixels(rate, sensor)
+    assert signal.shape == uneven.shape == (0, 0) and signal.dtype == np.float32 and uneven.dtype == np.bool_
