@@ -135,6 +135,7 @@ def test_frames_have_boxes_and_masks_of_coco(recorded, tmp_path):
     for entry, frame in zip(content["images"], recorded.frames, strict=True):
         image = recorded.stored_truth.read("frames/object", frame.index)
         assert (entry["height"], entry["width"]) == image.shape == frame.raw.shape
+        assert entry["t_us"] == frame.exposure_start_us + 0.5 * frame.exposure_us
         assert (out / "images" / entry["file_name"]).is_file()
         here = [item for item in content["annotations"] if item["image_id"] == entry["id"]]
         assert [item["track_id"] for item in here] == sorted(set(np.unique(image)) - {0})
