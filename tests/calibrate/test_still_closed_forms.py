@@ -249,3 +249,19 @@ def test_the_readout_limit_is_the_mean_of_the_fullest_windows():
     assert readout_limit([one])[0]["value"] is not None
     windows[[198, 199, 200]] = 4, 10, 5  # 19 are too few
     assert "it is at least 2e+05 events/s" in readout_limit([one])[0]["reason"]
+
+
+def test_a_target_whose_cycles_do_not_show_tells_no_thresholds():
+    count = np.full((2, 3 * target.GROUPS), 40.0)
+    tally = SimpleNamespace(
+        per_pixel=lambda: count, period_s=lambda: None, seconds=3.0, group=np.arange(count.shape[1])
+    )
+    found = target.thresholds(tally, 2.0, None)
+    assert "a pixel sees 0 cycles of the target, with 0 events of a polarity" in found.ratio["reason"]
+    few = target.thresholds(tally, 2.0, 0.9)
+    assert "a pixel sees 2.7 cycles of the target, with 14.8 events" in few.entries["theta_on"]["reason"]
+    # leak adds half a threshold a second to the rise, and hides as much of the fall
+    leaky = target.thresholds(tally, 2.0, 0.9, 4.0)
+    assert "with 12.6 events" in leaky.ratio["reason"]
+    count[:, 2 * target.GROUPS - 1 :] = 0
+    assert f"{2 * target.GROUPS} are needed" in target.thresholds(tally, 2.0, 5.0).ratio["reason"]

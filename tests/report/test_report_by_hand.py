@@ -452,3 +452,27 @@ def test_captures_are_simulated_of_the_kinds_of_pixels_that_a_sensor_has(events,
     assert shown == [(kind, pytest.approx(parts[kind])) for kind in kinds]
     # a sensor smaller than that is taken whole, without the rest of a tile
     assert simulate._region(sensor, (90, 90), (1, 2)) == (42, 30)
+
+
+def test_answers_are_the_first_events_of_the_right_polarity_within_the_window():
+    """Jumps up at 100, down at 180 and up at 300 µs: the window is the shortest time between two, or as stated."""
+    events = np.array(
+        [(99, 1, 1, 1), (100, 0, 1, 1), (130, 1, 0, 1), (140, 1, 0, 1), (150, 1, 1, -1), (178, 2, 1, 1), (180, 0, 0, 1),
+         (181, 0, 0, -1), (261, 2, 0, -1), (345, 2, 1, 1), (360, 2, 1, 1), (380, 0, 1, 1), (381, 1, 1, 1)],
+        [("t_us", "i8"), ("x", "u2"), ("y", "u2"), ("polarity", "i1")],
+    )  # fmt: skip
+    jumps = np.array([100, 180, 300]), np.array([True, False, True])
+    bench = SimpleNamespace(
+        stream=lambda file: [events[:4], events[4:10], events[10:]], _jumps=lambda steps, stream: jumps, pixels=6,
+        shape=(2, 3), path=str,
+    )  # fmt: skip
+    found = EventBench.answers_to(bench, SimpleNamespace(file="a", window_us=None))
+    assert found.window_us == 80
+    first, second, third = np.zeros((3, 6), int)
+    first[[0, 1, 5]] = 80, 30, 78  # the jump at 180 µs begins after the event at that time
+    second[0] = 1
+    third[[5, 3]] = 45, 80
+    np.testing.assert_array_equal(found.latency_us, [first, second, third])
+    short = EventBench.answers_to(bench, SimpleNamespace(file="a", window_us=50))
+    assert short.window_us == 50
+    np.testing.assert_array_equal(short.latency_us, [np.where(row <= 50, row, 0) for row in (first, second, third)])

@@ -167,3 +167,5 @@ def test_the_picture_has_three_colours_and_event_pixels_see_their_mean(monkeypat
     places = np.stack([asked[0].col, asked[0].row]).reshape(2, 9, 2)[:, :, 0] - [[2], [3]]
     assert sorted(np.rint(3 * places.T).tolist()) == [[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)]
     np.testing.assert_allclose(3 * places, np.rint(3 * places), atol=1e-12)
+    dark = look._seen(SimpleNamespace(brightness=brightness), np.array([[-9.0, 0.0]]), np.array([[3.0, 0.01]]), 17.0)
+    np.testing.assert_allclose(dark, [[1e-4, 2e-4]])  # black has a logarithm
