@@ -265,3 +265,17 @@ def test_a_target_whose_cycles_do_not_show_tells_no_thresholds():
     assert "with 12.6 events" in leaky.ratio["reason"]
     count[:, 2 * target.GROUPS - 1 :] = 0
     assert f"{2 * target.GROUPS} are needed" in target.thresholds(tally, 2.0, 5.0).ratio["reason"]
+
+
+def test_leaks_are_those_of_all_pixels_with_jackknife_errors():
+    """The first column is of all groups, the others leave one out; the unknown part is a square beside them."""
+    rng = np.random.default_rng(4)
+    leak = rng.uniform(1, 2, (2, 1)) + 0.05 * rng.standard_normal((2, 1 + GROUPS))
+    unknown = np.array([0.11, 0.3])
+    found = still._with_ratio(leak, unknown, None, {"value": 1.2})
+    for entry, row, unsure in zip(found.leaks, leak, unknown, strict=True):
+        parts = row[1:]
+        scatter = np.sqrt((GROUPS - 1) / GROUPS * np.sum((parts - parts.mean()) ** 2))
+        assert entry["value"] == pytest.approx(row[0]) and entry["unit"] == "Hz"
+        assert entry["standard_error"] == pytest.approx(np.hypot(scatter, unsure))
+    assert found.ratio == {"value": 1.2}

@@ -188,6 +188,7 @@ def test_videos_are_read_by_opencv(name, tmp_path):
         assert pictures[0].shape[:2] == tuple(5 * size for size in recording.frames[0].raw.shape)
         strongest = pictures[-1].astype(int).max(axis=(0, 1))
         assert strongest.max() > 60
+    assert movie.write_movie(recording, tmp_path / "colour.mp4", "mp4-colour") == 50
     with pytest.raises(RangeError, match="there are no events"):
         recordings.make("reference-bayer").export("mp4-events", tmp_path / "x.mp4")
     with pytest.raises(RangeError, match="there are no frames"):

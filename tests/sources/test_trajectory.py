@@ -120,7 +120,8 @@ def test_the_velocity_of_a_point_is_the_slope_of_its_path(repeat):
     """Central differences over 2 µs; 0 before the first keyframe and from the last one on, where the pose is held."""
     keys = [{"t_us": 4000, "translation_m": [0.1, 0, 0]},
             {"t_us": 7000, "translation_m": [0.3, 0.2, 0], "rotation_axis": [0, 1, 0], "rotation_deg": 50},
-            {"t_us": 12000, "translation_m": [0, -0.1, 0.4], "rotation_axis": [1, 0, 0], "rotation_deg": -20}]  # fmt: skip
+            {"t_us": 12000, "translation_m": [0, -0.1, 0.4], "rotation_axis": [1, 0, 0], "rotation_deg": -20},
+    ]  # fmt: skip
     moves = Trajectory(TrackSpec.model_validate(
         {"object": "camera", "pivot_m": [0.2, -0.1, 0.3], "keyframes": keys, "repeat": repeat}
     ))  # fmt: skip
