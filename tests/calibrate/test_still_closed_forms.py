@@ -279,3 +279,34 @@ def test_leaks_are_those_of_all_pixels_with_jackknife_errors():
         assert entry["value"] == pytest.approx(row[0]) and entry["unit"] == "Hz"
         assert entry["standard_error"] == pytest.approx(np.hypot(scatter, unsure))
     assert found.ratio == {"value": 1.2}
+
+
+def test_a_tenth_of_the_leak_is_an_error_of_the_thresholds_of_a_target(monkeypatch):
+    """12 thresholds of leak: half of them in 40 ON events, and 15/28 of as many missing in 30 OFF events."""
+    seen, scatter = [], np.diag([1e-4, 4e-4, 1e-6])
+
+    class Simulated:
+        def __init__(self, rise, cycles):
+            seen.append((rise, cycles))
+
+        def fit(self, wanted):
+            seen.append(wanted)
+            return np.array([0.21, 0.34, 0.09]), np.diag([2.0, 4.0, 1.0])
+
+        def moment_covariance(self, values):
+            return scatter
+
+    monkeypatch.setattr(target, "_Simulated", Simulated)
+    count = np.array([[40.0], [30.0]]) * np.ones(4 * target.GROUPS)
+    tally = SimpleNamespace(per_pixel=lambda: count, seconds=3.0, group=np.arange(count.shape[1]) % target.GROUPS)
+    found = target.thresholds(tally, 2.0, 4.0, 4.0)
+    assert seen[0] == (pytest.approx(np.log(2)), 12)
+    assert seen[1] == pytest.approx([(40 - 6) / 12, (30 + 12 * 15 / 28) / 12, 0])
+    unsure = 0.1 * 12 * np.array([0.5 / 40, 15 / 28 / 30])
+    for name, theta, leak, own in (("theta_on", 0.21, unsure[0], 1e-2 / 2), ("theta_off", 0.34, unsure[1], 2e-2 / 4)):
+        assert found.entries[name]["value"] == pytest.approx(theta)
+        assert found.entries[name]["standard_error"] == pytest.approx(np.hypot(theta * leak, own))
+    spread = found.entries["threshold_mismatch_rel"]
+    assert (spread["value"], spread["standard_error"]) == pytest.approx((0.3, 1e-3 / 0.6))
+    ratio, relative = 0.34 / 0.21, np.sqrt(unsure.sum() ** 2 + (5e-3 / 0.21) ** 2 + (5e-3 / 0.34) ** 2)
+    assert (found.ratio["value"], found.ratio["standard_error"]) == pytest.approx((ratio, ratio * relative))

@@ -302,3 +302,25 @@ def test_the_mismatch_of_both_polarities_is_weighed_by_their_covariance(on, off)
     whole[np.ix_(k, k)] = np.nan
     found = analysis._mismatch(SimpleNamespace(values=values, covariance=whole))
     assert (found.value, found.limit) == (0, max(on, off)) and np.isnan(found.error)
+
+
+def test_pixels_are_unlike_the_fit_by_any_test_that_few_fail(monkeypatch):
+    """Chunks of three of the eight good pixels; a test that more than a quarter fails tells of the fit, and is left."""
+    monkeypatch.setattr(defects, "_CHUNK", 3)
+    monkeypatch.setattr(defects, "_MOST_BAD", 0.25)
+    good = np.array([1, 1, 0, 1, 1, 1, 0, 1, 1, 1], bool)
+    failed = {1: np.zeros((3, 10), bool), -1: np.zeros((3, 10), bool)}
+    failed[1][0, [0, 9]] = True
+    failed[1][2, [1, 3, 4]] = True
+    failed[-1][1, 5] = failed[-1][2, 2] = True
+    chunks = []
+
+    def tests(fit, steady, steps, polarity):
+        assert fit == "fit" and np.array_equal(steady, steps)
+        chunks.append(len(steps))
+        return failed[polarity][:, steps]
+
+    monkeypatch.setattr(defects, "_tests", tests)
+    trials = SimpleNamespace(of=lambda some: some)
+    assert np.flatnonzero(defects.unlike("fit", trials, trials, good)).tolist() == [0, 5, 9]
+    assert chunks == [3, 3, 3, 3, 2, 2]
