@@ -274,3 +274,19 @@ def test_only_frequencies_that_stand_out_of_an_image_are_its_waves():
     # interference of that size at that frequency is noise of the mean of 12 frames: what is left of it is no wave
     hum = noise_spectrum.InterferenceLine(7 / rows, 13 / cols, 1.1 / np.sqrt(2) * np.sqrt(12))
     np.testing.assert_array_equal(spatial._waves(pixels + sine, noise, SimpleNamespace(lines=[hum]), 12), 0)
+
+
+def test_a_line_at_one_place_is_a_weighted_mean_without_a_slope():
+    y, error = np.array([3.0, 5.0, 8.0]), np.array([0.1, 0.2, 0.4])
+    found = light_curve.straight(np.full(3, 7.0), y, error)
+    weight = 1 / error**2
+    mean = np.average(y, weights=weight)
+    scale = light_curve._scale(float(np.sum(weight * (y - mean) ** 2)) / 2, 2)
+    assert (found.value, found.error) == pytest.approx((mean, np.sqrt(scale / weight.sum())))
+    assert found.slope == 0 and np.isnan(found.slope_error) and found.groups == 3
+    assert found.rms == pytest.approx(np.sqrt(np.sum((y - mean) ** 2) / 2))
+    np.testing.assert_allclose(found.error_at(np.array([2.0, 90.0])), found.error)
+    x = np.array([1.0, 2.0, 4.0])
+    line = light_curve.straight(x, y, error)
+    np.testing.assert_allclose([line.slope, line.value], np.polyfit(x, y, 1, w=1 / error))
+    assert line.error_at(np.zeros(1))[0] == pytest.approx(line.error) and line.groups == 2

@@ -310,3 +310,14 @@ def test_a_tenth_of_the_leak_is_an_error_of_the_thresholds_of_a_target(monkeypat
     assert (spread["value"], spread["standard_error"]) == pytest.approx((0.3, 1e-3 / 0.6))
     ratio, relative = 0.34 / 0.21, np.sqrt(unsure.sum() ** 2 + (5e-3 / 0.21) ** 2 + (5e-3 / 0.34) ** 2)
     assert (found.ratio["value"], found.ratio["standard_error"]) == pytest.approx((ratio, ratio * relative))
+
+
+def test_simulated_moments_have_the_covariance_of_their_groups():
+    simulated = target._Simulated(2.1, 3)
+    values = np.array([0.22, 0.31, 0.08**2])
+    count = simulated._counts(values)
+    every = []
+    for k in range(GROUPS):
+        own = count[:, k::GROUPS]
+        every.append([own[0].mean(), own[1].mean(), np.mean(own.var(axis=1, ddof=1) / own.mean(axis=1) ** 2)])
+    np.testing.assert_allclose(simulated.moment_covariance(values), np.cov(np.transpose(every)) / GROUPS)

@@ -331,8 +331,7 @@ def test_an_instrument_knows_the_flux_of_each_pixel_and_writes_its_files(tmp_pat
     made._stage()
     made._stage()
     assert made._seed == 7
-    events = no_events()
-    events.resize(2)
+    events = np.zeros(2, no_events().dtype)
     events["t_us"], events["x"], events["y"], events["polarity"] = [3, 9], [1, 0], [0, 1], [1, -1]
     made._save(events, "a")
     stream = np.concatenate(list(open_events(tmp_path / "a.raw")))
