@@ -8,6 +8,7 @@ from scipy.special import ndtr
 from scipy.stats import norm
 
 from hesim_render.calibrate.asynchronous import fit as trials_fit
+from hesim_render.calibrate.asynchronous import likelihood
 from hesim_render.calibrate.evs import analysis, dispersion, thresholds
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_probability
@@ -261,3 +262,21 @@ def test_errors_of_resampling_are_those_of_fits_to_weighted_pixels(monkeypatch):
     drawn = np.random.default_rng(8).poisson(1.0, (5, 6))
     np.testing.assert_array_equal(asked, drawn)
     np.testing.assert_allclose(error, np.std(drawn[:, :4], axis=0, ddof=1) * [1.0, 3.0, 10.0, 0.5])
+
+
+@pytest.mark.parametrize(("law", "power"), [("sqrt", 1), ("linear", 2)])
+def test_the_noise_of_trials_is_a_thousandth_of_the_threshold_or_more(law, power):
+    values = np.zeros(9)
+    values[[0, 1, likelihood.RESPONSE]] = 0.3, 0.9, 0.05
+    light = np.array([0.0, 30.0])
+    np.testing.assert_allclose(likelihood.noise_of(values, light, law), 3e-4)
+    values[[likelihood.SHOT, likelihood.DARK]] = 2e-6, 7e-6
+    own = (2e-6 * light**power + 7e-6) / (1 + 0.05 * light) ** 2
+    np.testing.assert_allclose(likelihood.noise_of(values, light, law), np.sqrt(own + 9e-8))
+
+
+@pytest.mark.parametrize(("mismatch", "reach"), [(0.1, (0.4, 1.6)), (0.2, (0.03, 2.2)), (0.001, (0.95, 1.05))])
+def test_grids_of_thresholds_reach_six_spreads_on_both_sides(mismatch, reach):
+    grid = likelihood.threshold_grid(0.4, mismatch)
+    assert grid.size == 97 and (grid[0], grid[-1]) == pytest.approx((0.4 * reach[0], 0.4 * reach[1]))
+    np.testing.assert_allclose(np.diff(grid), 0.4 * (reach[1] - reach[0]) / 96)
