@@ -476,3 +476,71 @@ def test_answers_are_the_first_events_of_the_right_polarity_within_the_window():
     short = EventBench.answers_to(bench, SimpleNamespace(file="a", window_us=50))
     assert short.window_us == 50
     np.testing.assert_array_equal(short.latency_us, [np.where(row <= 50, row, 0) for row in (first, second, third)])
+
+
+def modulation(bursts=None, hz=2000.0, file="a"):
+    return SimpleNamespace(file=file, hz=hz, bursts=bursts, depth=0.5, lux=9.0)
+
+
+def bench_of(rows, span_us, group):
+    """A bench of 2 by 3 pixels with events (t_us, x, y, polarity), in two blocks."""
+    events = np.array(rows, [("t_us", "i8"), ("x", "u2"), ("y", "u2"), ("polarity", "i1")])
+
+    class Stream(list):
+        def span_us(self):
+            return span_us
+
+    half = len(events) // 2
+    return SimpleNamespace(
+        stream=lambda file: Stream([events[:half], events[half:]]), pixels=6, shape=(2, 3), path=str,
+        tally=lambda file: SimpleNamespace(group=np.array(group)),
+    )  # fmt: skip
+
+
+def test_cycles_with_an_answer_are_counted_after_two_warm_ones():
+    """500 µs a cycle from 40 µs on: three whole ones begin at 1040 µs. A polarity or a burst's length decides."""
+    rows = [(1039, 0, 0, 1), (1040, 0, 0, 1), (1100, 0, 0, 1), (1539, 1, 0, 1), (1540, 2, 0, 1), (1600, 0, 1, -1),
+            (2000, 2, 0, -1), (2539, 2, 1, 1), (2541, 0, 0, 1), (2541, 1, 1, -1)]  # fmt: skip
+    bench, good = bench_of(rows, (40, 2560), [0, 0, 1, 1, 2, 5]), np.array([1, 1, 1, 0, 1, 1], bool)
+    assert modulated._cycles(bench, modulation()) == (1040.0, 500.0, 3)
+    share = np.array([1, 1, 1, 0, 0, 1]) / 3
+    expected = np.full(modulated.GROUPS + 1, share[good].mean())
+    for group, left in ((0, [2, 4, 5]), (1, [0, 1, 4, 5]), (2, [0, 1, 2, 5]), (5, [0, 1, 2, 4])):
+        expected[1 + group] = share[left].mean()
+    np.testing.assert_allclose(modulated._answered(bench, modulation(), good), expected)
+    counts = np.array([[2, 1, 1, 0, 0, 1], [0, 0, 1, 1, 0, 0]]) / 3
+    np.testing.assert_allclose(modulated._counts(bench, modulation(), good)[:, 0], counts[:, good].mean(axis=1))
+    bursts = SimpleNamespace(period_us=700, begin_us=1040, length_us=60)
+    assert modulated._cycles(bench, modulation(bursts)) == (1040.0, 700.0, 2)
+    # within 60 µs of 1040 and 1740 µs, of either polarity
+    assert modulated._answered(bench, modulation(bursts), good)[0] == pytest.approx(np.mean([0.5, 0, 0, 0, 0]))
+    short = bench_of(rows, (40, 1539), [0] * 6)
+    assert np.isnan(modulated._answered(short, modulation(), good)).all()
+    assert not modulated._counts(short, modulation(), good).any()
+
+
+def test_the_swing_that_half_answer_lies_between_those_around_it():
+    parts = [(0.8, np.array([0.9, 0.2])), (0.2, np.array([0.1, 0.1])), (0.4, np.array([0.4, 0.15]))]
+    expected = crossing(np.log([0.2, 0.4, 0.8]), np.array([0.1, 0.4, 0.9]), np.zeros(3), 0.5, 1e4)
+    assert modulated._half(parts, 0) == pytest.approx(np.exp(expected[0])) and 0.4 < np.exp(expected[0]) < 0.5
+    assert np.isnan(modulated._half(parts, 1))
+    assert np.isnan(modulated._half([*parts, (1.0, np.array([np.nan, 1.0]))], 0))
+
+
+@pytest.mark.parametrize(
+    ("shares", "reason"),
+    [
+        ({100: 0.2, 300: 0.2, 900: 0.2}, "answered at fewer than two frequencies"),
+        ({100: 0.8, 300: 0.8, 900: 0.2}, "above 300 Hz"),
+        ({100: 0.8, 300: 0.8, 900: 0.8}, "above 900 Hz"),
+    ],
+)
+def test_what_bandwidth_lacks_is_said(shares, reason, monkeypatch):
+    monkeypatch.setattr(modulated, "_answered", lambda bench, one, good: np.full(21, shares[int(one.hz)] * one.depth))
+    each = [(float(hz), depth) for hz in shares for depth in (0.3, 0.9)]
+    every = [SimpleNamespace(**{**vars(modulation(hz=hz)), "depth": depth}) for hz, depth in each]
+    bench = SimpleNamespace(spec=SimpleNamespace(modulation=every))
+    found = modulated.bandwidth(bench, np.array([True, True, False]))
+    assert reason in found.entry["reason"] and found.pixels == 2 and found.hz.tolist() == [100, 300, 900]
+    bench.spec.modulation = []
+    assert modulated.bandwidth(bench, np.ones(3, bool)) is None
