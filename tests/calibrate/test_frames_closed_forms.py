@@ -7,6 +7,7 @@ import pytest
 import yaml
 from scipy.stats import chi2, norm
 
+from hesim_render.calibrate.aps import calibration as frame_calibration
 from hesim_render.calibrate.aps import checks, common_mode, composite, dark, sensor_file, telegraph, variance
 from hesim_render.calibrate.estimate import ALARM
 
@@ -325,3 +326,32 @@ def test_sensors_without_event_pixels_have_no_signal_at_them():
     rate = SimpleNamespace(rate_dn_per_s=np.ones((4, 4)), standard_error_dn_per_s=np.ones((4, 4)))
     signal, uneven = composite.signal_at_event_pixels(rate, sensor)
     assert signal.shape == uneven.shape == (0, 0) and signal.dtype == np.float32 and uneven.dtype == np.bool_
+
+
+def test_pixels_are_unlike_their_kind_by_the_scatter_of_their_variances():
+    """Σ (n − 1)(s²/σ² − 1) over what is clear, over √(2 Σ (n − 1)): eight robust widths decide, or eight errors."""
+    rng, shape = np.random.default_rng(6), (14, 18)
+    beta = np.array([[[3.0, 0.02, 0.5, 0, 0, 0], [5.0, 0.03, 0.2, 0, 0, 0]]])
+    sets, sums, freedom = [], np.zeros(shape), np.zeros(shape)
+    odd = rng.random(shape) < 0.1
+    factor = np.where(odd, rng.uniform(2.5, 5.0, shape), 1.0)
+    for frames, times, light in ((6, [0.1, 0.7], 0.0), (11, [0.2, 0.5, 0.9], 300.0)):
+        signals = light * rng.uniform(0.5, 1, (len(times), *shape))
+        mask = rng.random(signals.shape) < 0.8
+        variance = np.empty(signals.shape)
+        for k, t in enumerate(times):
+            terms = np.array([np.ones(shape), signals[k], np.full(shape, t)])
+            tiled = np.tile(beta[0, :, :3], (shape[1] // 2, 1)).T[:, None]
+            expected = np.sum(tiled * terms, axis=0) + 1 / 12
+            variance[k] = expected * factor * rng.chisquare(frames - 1, shape) / (frames - 1)
+            sums += mask[k] * (frames - 1) * (variance[k] / expected - 1)
+            freedom += mask[k] * (frames - 1)
+        moments = SimpleNamespace(exposures_s=np.array(times), variance=variance, frames=frames, mean=variance)
+        sets.append((moments, mask, signals))
+    (dark, dark_clear, _), (lit, usable, signals) = sets
+    scaled = sums / np.sqrt(2 * np.maximum(freedom, 1))
+    width = 1.4826 * np.median(np.abs(scaled - np.median(scaled)))
+    expected = np.abs(scaled) > 8 * max(1.0, width)
+    assert expected.sum() > 5 and (odd & ~expected).sum() > 5
+    found = frame_calibration._unlike_their_kind(beta, dark, lit, signals.astype(np.float32), dark_clear, usable)
+    np.testing.assert_array_equal(found, expected)
