@@ -11,6 +11,7 @@ from hesim_render.calibrate.asynchronous import checks as trial_checks
 from hesim_render.calibrate.asynchronous.likelihood import LEAK, NAMES, RESPONSE
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
 from hesim_render.calibrate.evs import fitted, medians
+from hesim_render.calibrate.evs import goodness as good_fit
 from hesim_render.calibrate.evs.cells import Cells, PixelThresholds, brightness_edges, pool_events
 from hesim_render.calibrate.evs.model import log_likelihood, log_probability
 from hesim_render.calibration.spec import Defect
@@ -324,3 +325,46 @@ def test_pixels_are_unlike_the_fit_by_any_test_that_few_fail(monkeypatch):
     trials = SimpleNamespace(of=lambda some: some)
     assert np.flatnonzero(defects.unlike("fit", trials, trials, good)).tolist() == [0, 5, 9]
     assert chunks == [3, 3, 3, 3, 2, 2]
+
+
+@pytest.mark.parametrize("weighed", [False, True])
+def test_goodness_is_the_quadratic_form_of_groups_with_their_own_scatter(weighed, monkeypatch):
+    """Two sessions of 60 pixels in four groups, two wide ones; ON and OFF are correlated, and the dark is one group."""
+    rng = np.random.default_rng(12)
+    means = rng.uniform(3, 40, (4, 60)) * np.array([[1.0], [2.0], [0.1], [0.3]])
+    noise = rng.normal(size=(4, 60))
+    noise[1] = 0.6 * noise[0] + 0.8 * noise[1]
+    counts = means + 1.4 * np.sqrt(means) * noise
+    group, wide = np.arange(60) % 4, np.array([0, 1, 1, 0])
+    weight = rng.integers(0, 3, 60) if weighed else None
+    pixels = SimpleNamespace(
+        is_dark=np.array([False, False, True, True]), cells=SimpleNamespace(trials=50), counts=counts,
+        single=lambda k: k, signal_dn=np.arange(60.0), weight=weight,
+    )  # fmt: skip
+    asked = []
+
+    def wider(events):
+        asked.append(events)
+        return wide if events.size == 4 else np.zeros(events.size, int)
+
+    monkeypatch.setattr(good_fit, "probability", lambda values, k, theta_v, law: means[k] / 50)
+    monkeypatch.setattr(good_fit, "_groups", lambda signal, events: asked.append(events) or group)
+    monkeypatch.setattr(good_fit, "_wider", wider)
+    found = good_fit.goodness(pixels, np.zeros(6), 0.3, "sqrt", 5)
+    each = np.ones(60) if weight is None else weight
+    chi2 = 0.0
+    for on, off, number, wider in ((0, 1, group, wide), (2, 3, 0 * group, np.zeros(1, int))):
+        residual = counts[[on, off]] - means[[on, off]]
+        effect = max(1.0, *(np.sum(residual**2, axis=1) / means[[on, off]].sum(axis=1)))
+        alike = [number == g for g in range(number.max() + 1)]
+        expected = np.array([[(each * means[k])[some].sum() for some in alike] for k in (on, off)])
+        if on == 0:
+            np.testing.assert_allclose(asked[0], np.minimum(means[0], means[1]) / effect)
+        np.testing.assert_allclose(asked[1 if on == 0 else 2], expected.min(axis=0) / effect)
+        for g, some in enumerate(alike):
+            near = np.isin(number, np.flatnonzero(wider == wider[g]))
+            size = expected[:, wider == wider[g]].sum(axis=1)
+            matrix = (each * residual)[:, near] @ residual[:, near].T / np.sqrt(np.outer(size, size))
+            total = (each * residual)[:, some].sum(axis=1) / np.sqrt(expected[:, g])
+            chi2 += total @ np.linalg.solve(matrix, total)
+    assert found.chi2 == pytest.approx(chi2) and found.dof == 2 * 5 - 5

@@ -544,3 +544,15 @@ def test_what_bandwidth_lacks_is_said(shares, reason, monkeypatch):
     assert reason in found.entry["reason"] and found.pixels == 2 and found.hz.tolist() == [100, 300, 900]
     bench.spec.modulation = []
     assert modulated.bandwidth(bench, np.ones(3, bool)) is None
+
+
+@pytest.mark.parametrize(("step", "start", "ticks"), [(1, 0, False), (2, 5, True), (3, 0, True), (50, 7, True)])
+def test_pixels_with_ticks_have_times_that_are_multiples_of_one(step, start, ticks):
+    times = start + step * np.array([0, 4, 10, 15, 22])
+    events = np.zeros(5, [("t_us", "i8")])
+    events["t_us"] = times
+    spec = SimpleNamespace(steps=[SimpleNamespace(file="a")] * 4)
+    bench = SimpleNamespace(spec=spec, stream=lambda file: [events[:3], events[2:], events[:0]])
+    assert figures._has_ticks(bench) == ticks
+    bench.stream = lambda file: [events[:1]]
+    assert not figures._has_ticks(bench)  # nothing tells
