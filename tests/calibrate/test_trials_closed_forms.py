@@ -1,5 +1,6 @@
 """Counts of event pixels: cells by a loop, tails of defects, rates of first events, losses and floors by hand."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,11 +11,12 @@ from hesim_render.calibrate.asynchronous import analysis, defects
 from hesim_render.calibrate.asynchronous import checks as trial_checks
 from hesim_render.calibrate.asynchronous.likelihood import LEAK, NAMES, RESPONSE
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
-from hesim_render.calibrate.evs import fitted, medians
+from hesim_render.calibrate.evs import fitted, medians, steps
 from hesim_render.calibrate.evs import goodness as good_fit
 from hesim_render.calibrate.evs.cells import Cells, PixelThresholds, brightness_edges, pool_events
 from hesim_render.calibrate.evs.model import log_likelihood, log_probability
 from hesim_render.calibration.spec import Defect
+from hesim_render.core.errors import SpecError
 
 
 @pytest.mark.parametrize("position", [None, 1])
@@ -368,3 +370,32 @@ def test_goodness_is_the_quadratic_form_of_groups_with_their_own_scatter(weighed
             total = (each * residual)[:, some].sum(axis=1) / np.sqrt(expected[:, g])
             chi2 += total @ np.linalg.solve(matrix, total)
     assert found.chi2 == pytest.approx(chi2) and found.dof == 2 * 5 - 5
+
+
+def test_counts_of_steps_are_sums_over_groups_of_good_pixels(monkeypatch):
+    """The light may be a number, or a map of which nearly all good pixels are within a tenth."""
+    rng, shape = np.random.default_rng(3), (6, 9)
+    good = rng.random(shape) < 0.7
+    counts = {name: rng.integers(0, 20, (2, *shape)) for name in ("n_on", "n_off")}
+    group = rng.integers(0, steps.GROUPS, shape)
+    light = np.where(good, 50 + 0.04 * np.arange(54).reshape(shape), 900.0)
+    given, contrast = [light], np.array([0.2, -0.3])
+    monkeypatch.setattr(steps, "read_contrast", lambda captures, more: (contrast, given[0], {"n_trials": 40}))
+    monkeypatch.setattr(steps, "single_number", lambda value, *name, **limits: value)
+    monkeypatch.setattr(steps, "step_maps", lambda captures, name, *sizes: counts[name])
+    monkeypatch.setattr(steps, "pixel_groups", lambda shape: group)
+    captures = SimpleNamespace(folder=Path("captures"))
+    found = steps.read_steps(captures, good)
+    for name, sums, total in (("n_on", found.on, found.on_total), ("n_off", found.off, found.off_total)):
+        np.testing.assert_array_equal(total, counts[name].sum(axis=0))
+        for k in range(2):
+            for g in np.unique(group):
+                assert sums[k, g] == counts[name][k][good & (group == g)].sum()
+    assert found.signal_dn == np.median(light[good]) and found.trials == 40
+    assert found.pixels.sum() == good.sum() and found.pixels[group[good][0]] == (good & (group == group[good][0])).sum()
+    given[0] = np.array(77.0)
+    assert steps.read_steps(captures, good).signal_dn == 77
+    for wrong, words in ((light[:5], "is of size"), (np.where(good, 50 + np.arange(54).reshape(shape), 0), "10 %")):
+        given[0] = wrong
+        with pytest.raises(SpecError, match=words):
+            steps.read_steps(captures, good)
