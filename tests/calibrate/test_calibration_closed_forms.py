@@ -41,6 +41,7 @@ from hesim_render.calibrate.evs.steps import GROUPS, Steps
 from hesim_render.calibrate.evs.thresholds import Thresholds, curve
 from hesim_render.calibrate.flicker import dynamics
 from hesim_render.calibration.spec import Defect
+from hesim_render.core.errors import SpecError
 
 BETA = np.array([4.0, 0.3, 20.0, 2e-5, 0.05, 30.0])  # 1, I, t, I², I t, t²
 FRAMES, TAU = 16, 6.0
@@ -704,3 +705,29 @@ def test_a_flickering_pixel_has_the_chance_of_the_time_in_which_it_fires():
     assert found.on[5, 7] * found.firing_share[5, 7] == pytest.approx(0.12, rel=0.005) and found.off[5, 7] == 0
     assert 0.9 < found.correlation[5, 7] < 1
     assert np.all(found.on[~bad] == 0) and np.all(found.firing_share[~bad] == 1)
+
+
+def test_without_maps_of_frames_there_is_no_signal_at_event_pixels(tmp_path, monkeypatch):
+    """No calibration yet, none at all, or one of events alone; and pixels whose filter no frame pixel has."""
+    (tmp_path / "events.yaml").write_text("")
+    monkeypatch.setattr(counts, "read_calibration", lambda _: {"evs": {}})
+    captures = SimpleNamespace(folder=tmp_path, spec=SimpleNamespace(signal_reference=None))
+    for calibration in (None, tmp_path / "none.yaml", tmp_path / "events.yaml"):
+        with pytest.raises(SpecError, match="holds no array 'signal_dn'"):
+            counts._composite_signal(captures, calibration, tmp_path / "evs_static.npz")
+
+
+@pytest.mark.parametrize("part", [8, 12, 40])
+def test_parts_of_a_dark_capture_are_eight_or_more_and_add_up(part):
+    rng = np.random.default_rng(1)
+    parts = rng.integers(0, 5, (part, 3, 4))
+    on = parts.sum(axis=0) // 3
+    maps = {"dark_n_on": on, "dark_n_off": parts.sum(axis=0) - on}
+    assert counts._parts({"dark_parts": parts}, maps, 120, "a.npz") is parts
+    for wrong, trials, words in (
+        (parts[:7], 70, "holds 7 parts"), (parts, 119, "a divisor of n_trials"), (parts[:, :2], 120, "whole numbers"),
+        (parts + 1, 120, "does not add up"), (parts * 1.0, 120, "whole numbers"),
+    ):  # fmt: skip
+        with pytest.raises(SpecError, match=words):
+            counts._parts({"dark_parts": wrong}, maps, trials, "a.npz")
+    assert counts._parts({}, maps, 120, "a.npz") is None
