@@ -10,6 +10,7 @@ from scipy.stats import chi2, norm
 from hesim_render.calibrate.aps import calibration as frame_calibration
 from hesim_render.calibrate.aps import checks, common_mode, composite, dark, sensor_file, telegraph, variance
 from hesim_render.calibrate.estimate import ALARM
+from hesim_render.core.errors import SpecError
 
 
 def test_lines_of_pixels_that_lack_exposures_are_those_of_polyfit():
@@ -355,3 +356,27 @@ def test_pixels_are_unlike_their_kind_by_the_scatter_of_their_variances():
     assert expected.sum() > 5 and (odd & ~expected).sum() > 5
     found = frame_calibration._unlike_their_kind(beta, dark, lit, signals.astype(np.float32), dark_clear, usable)
     np.testing.assert_array_equal(found, expected)
+
+
+def test_light_is_there_from_five_deviations_of_a_mean_on_and_until_98_per_cent_are_saturated():
+    """The longest exposure: √(36/9 + 5) = 3 DN, median of the good pixels."""
+    good = np.arange(400).reshape(20, 20) % 5 > 0
+    variance = np.where(good, 36.0, 900.0)[None] * np.array([0.1, 1.0])[:, None, None]
+    lit = SimpleNamespace(
+        highest=np.full((2, 20, 20), 200), variance=variance, frames=9, exposures_s=np.array([0.1, 0.4])
+    )  # fmt: skip
+    dark = SimpleNamespace(mean_variance=lambda t: {0.1: 0.0, 0.4: 5.0}[t])
+
+    def check(level):
+        signals = np.stack([np.full((20, 20), 900.0), np.where(good, level, 900.0)])
+        frame_calibration._check_light(dark, lit, signals, good, 255)
+
+    check(15.1)
+    with pytest.raises(SpecError, match="no light above the dark"):
+        check(14.9)
+    lit.highest[:] = 255
+    lit.highest[0][good & (np.arange(400).reshape(20, 20) < 18)] = 200  # 14 of 640
+    check(15.1)
+    lit.highest[0, 0] = 255
+    with pytest.raises(SpecError, match="saturated at every exposure"):
+        check(15.1)

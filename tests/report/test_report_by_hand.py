@@ -10,7 +10,7 @@ from scipy import special
 from scipy.stats import norm
 
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, s_curves, simulate
+from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, run, s_curves, simulate
 from hesim_render.report.bench import EventBench
 from hesim_render.report.estimates import crossing, log_estimated, mean_error, quantile, whole_us_quantile
 from hesim_render.report.latency import Answers
@@ -556,3 +556,32 @@ def test_pixels_with_ticks_have_times_that_are_multiples_of_one(step, start, tic
     assert figures._has_ticks(bench) == ticks
     bench.stream = lambda file: [events[:1]]
     assert not figures._has_ticks(bench)  # nothing tells
+
+
+@pytest.mark.parametrize("kinds", [("events",), ("frames",), ("events", "frames")])
+def test_a_report_has_each_table_once_and_a_page_for_each_kind_of_pixels(kinds, monkeypatch, tmp_path):
+    told = []
+
+    class Pages:
+        count = 3
+
+        def __init__(self, file, title):
+            told.append(title)
+
+        def __getattr__(self, name):
+            return lambda *given: told.append((name, *given[:1]))
+
+    for name in ("events", "frames"):
+        kind = name.removesuffix("s")
+        monkeypatch.setattr(run, f"{kind}_tables", lambda _, name=name: [f"{name} {k}" for k in range(3)])
+        monkeypatch.setattr(run, f"{kind}_drawings", lambda _: [])
+    for name in ("_about", "_json", "filled"):
+        monkeypatch.setattr(run, name, lambda *given, **more: "about")
+    monkeypatch.setattr(run, "Document", Pages)
+    given = [SimpleNamespace(findings=[name]) if name in kinds else None for name in ("events", "frames")]
+    assert run._write(tmp_path, "mine", *given) == 3
+    assert [one[1] for one in told[1:] if one[0] == "table"] == [f"{name} {k}" for name in kinds for k in range(3)]
+    texts = ["Test report: mine", "about", *(f"Note: {name}" for name in kinds)]
+    assert [one[1] for one in told[1:] if one[0] == "text"] == texts
+    # frames alone have a page of figures, and both kinds begin pages of their own
+    assert told.count(("new_page",)) == (0 if kinds == ("events",) else 1) and told[-1] == ("close",)
