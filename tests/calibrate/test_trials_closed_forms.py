@@ -399,3 +399,49 @@ def test_counts_of_steps_are_sums_over_groups_of_good_pixels(monkeypatch):
         given[0] = wrong
         with pytest.raises(SpecError, match=words):
             steps.read_steps(captures, good)
+
+
+@pytest.mark.parametrize(("advantage", "law"), [(4.0, "linear"), (6.0, "sqrt"), (900.0, "sqrt"), (-900.0, "linear")])
+def test_trials_are_fitted_to_good_pixels_by_the_law_that_is_likelier(advantage, law, monkeypatch):
+    """Two plainly bad pixels of 90, and a third that is unlike the first fit; the laws are compared on 50 pixels."""
+    plain, other = np.zeros(90, bool), np.zeros(90, bool)
+    plain[[4, 70]] = other[33] = True
+    fits, asked = [], []
+
+    def fit(sets, law, start, rounds=None):
+        fits.append((set(sets[0].tolist()), law, start, rounds))
+        return SimpleNamespace(
+            law=law, values=np.array([float(len(fits))]),
+            covariance=np.eye(9), log_likelihood=advantage if law == "sqrt" else 0.0,
+        )  # fmt: skip
+
+    def unlike(fitted, steady, steps, good):
+        asked.append(good.copy())
+        return other & good
+
+    trials = SimpleNamespace(of=np.asarray)
+    changes = {
+        "read_trials": lambda captures: (trials, trials), "plainly_bad": lambda *_: plain.copy(), "fit_trials": fit,
+        "rough_start": lambda steady, steps, good, law: (law, good.sum()), "unlike": unlike,
+        "_pixel_thresholds": lambda fitted, steady, steps, polarity: (polarity, -polarity), "_mismatch": lambda _: "m",
+        "check_trials": lambda fitted, sets: (["finding"], {"all": len(sets[0])}),
+        "classify": lambda steady, steps, bad: np.flatnonzero(bad).tolist(), "_FEW": 50, "MOST_PIXELS": 80,
+    }  # fmt: skip
+    for name, value in changes.items():
+        monkeypatch.setattr(analysis, name, value)
+    found = analysis.analyse_trials(SimpleNamespace(folder=None), seed=3)
+    glances = fits[:2]
+    assert [one[1] for one in glances] == ["linear", "sqrt"] and all(one[2] == (one[1], 88) for one in glances)
+    assert all(len(one[0]) == 50 and one[3] == analysis._GLANCE for one in glances)
+    assert not glances[0][0] & {4, 70} and glances[0][0] == glances[1][0]
+    close = abs(advantage) < 500
+    assert len(fits) == (6 if close else 4) and [one[1] for one in fits[-2:]] == [law, law]
+    first, second = fits[-2:]
+    assert len(first[0]) == len(second[0]) == 80 and not first[0] & {4, 70} and not second[0] & {4, 70, 33}
+    assert np.flatnonzero(~asked[0]).tolist() == [4, 70] and np.flatnonzero(~asked[1]).tolist() == [4, 33, 70]
+    assert found.defects == [4, 33, 70] and found.advantage == (advantage if law == "sqrt" else -advantage)
+    assert (found.relative, found.noise) == ((1, -1), (-1, 1)) and set(found.fitted.tolist()) == second[0]
+    assert found.goodness == {"all": 80} and found.findings == ["finding"] and found.mismatch == "m"
+    monkeypatch.setattr(analysis, "plainly_bad", lambda *_: np.arange(90) < 46)
+    with pytest.raises(SpecError, match="46 of 90 event pixels"):
+        analysis.analyse_trials(SimpleNamespace(folder=None))
