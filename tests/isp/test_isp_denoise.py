@@ -383,3 +383,22 @@ def test_patches_that_begin_within_a_block_have_the_colours_of_their_own_places(
     expected = np.full((15, 21), 10.0)
     expected[2:, 3:] = (5 + 30) / 2
     np.testing.assert_allclose(found, expected)
+
+
+def test_means_of_blocks_are_samples_a_block_apart(monkeypatch):
+    """Blocks of 6 by 4 px: 2 × 2 of their means are a block of samples, whose places are those of the picture."""
+    seen = []
+
+    def one_pass(blocks, known):
+        seen.append((blocks, known))
+        return 3.0 * blocks.values, np.full(blocks.values.shape[:2], 1.5, np.float32)
+
+    monkeypatch.setattr(denoising.collaborate, "one_pass", one_pass)
+    means = np.random.default_rng(1).normal(size=(2, 8, 10)).astype(np.float32)
+    found = denoising._reduced_means(means, (6, 4), np.array([5.0, 9.0]))
+    blocks, known = seen[0]
+    np.testing.assert_array_equal(blocks.at, [[0, 0], [0, 4], [6, 0], [6, 4]] * 2)
+    assert blocks.size == (12, 8) and known is None and len(seen) == 2
+    assert blocks.channel.tolist() == [0] * 4 + [1] * 4 and blocks.amplitude.tolist() == [5.0] * 4 + [9.0] * 4
+    np.testing.assert_allclose(seen[1][1], 2 * blocks.values, rtol=1e-6)
+    np.testing.assert_allclose(found, 2 * means, rtol=1e-6)
