@@ -321,3 +321,20 @@ def test_simulated_moments_have_the_covariance_of_their_groups():
         own = count[:, k::GROUPS]
         every.append([own[0].mean(), own[1].mean(), np.mean(own.var(axis=1, ddof=1) / own.mean(axis=1) ** 2)])
     np.testing.assert_allclose(simulated.moment_covariance(values), np.cov(np.transpose(every)) / GROUPS)
+
+
+def test_simulated_pixels_turn_at_the_ends_of_the_swing(monkeypatch):
+    """A loop over nine pixels: levels begin anywhere in the swing, and the first four cycles are not counted."""
+    monkeypatch.setattr(target, "_PIXELS", 9)
+    simulated = target._Simulated(1.7, 3)
+    counts = simulated._counts(np.array([0.31, 0.23, 0.15**2]))
+    assert sorted(simulated._start) == pytest.approx((np.arange(9) + 0.5) / 9)
+    for k in range(9):
+        on, off = 0.31 * (1 + 0.15 * simulated._z[0, k]), 0.23 * (1 + 0.15 * simulated._z[1, k])
+        level, ups, downs = 1.7 * simulated._start[k], 0, 0
+        for cycle in range(7):
+            while level + on <= 1.7 + 1e-9:
+                level, ups = level + on, ups + (cycle >= 4)
+            while level - off >= -1e-9:
+                level, downs = level - off, downs + (cycle >= 4)
+        assert counts[:, k] == pytest.approx([ups / 3, downs / 3])

@@ -9,6 +9,7 @@ from scipy.stats import norm, poisson
 
 from hesim_render.calibrate.asynchronous import analysis, defects
 from hesim_render.calibrate.asynchronous import checks as trial_checks
+from hesim_render.calibrate.asynchronous import trials as trials_module
 from hesim_render.calibrate.asynchronous.likelihood import LEAK, NAMES, RESPONSE
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
 from hesim_render.calibrate.evs import fitted, medians, steps
@@ -445,3 +446,47 @@ def test_trials_are_fitted_to_good_pixels_by_the_law_that_is_likelier(advantage,
     monkeypatch.setattr(analysis, "plainly_bad", lambda *_: np.arange(90) < 46)
     with pytest.raises(SpecError, match="46 of 90 event pixels"):
         analysis.analyse_trials(SimpleNamespace(folder=None))
+
+
+@pytest.mark.parametrize(
+    ("reference", "files", "kind"),
+    [
+        (None, {"evs_static"}, False), (None, {"evs_s_curve"}, True), (None, {"evs_noise_rate"}, True),
+        ("last_event", {"evs_s_curve"}, True), ("last_event", set(), True), ("last_event", {"evs_static"}, "reset"),
+        ("previous_sample", {"evs_static"}, False), ("previous_sample", {"evs_noise_rate"}, "fixed ticks"),
+    ],
+)  # fmt: skip
+def test_captures_are_of_trials_by_their_files_or_their_sensor(reference, files, kind, monkeypatch):
+    monkeypatch.setattr(trials_module, "S_CURVE", "evs_s_curve")
+    monkeypatch.setattr(trials_module, "NOISE_RATE", "evs_noise_rate")
+    sensor = None if reference is None else SimpleNamespace(evs=SimpleNamespace(reference=reference))
+    captures = SimpleNamespace(sensor=sensor, has=files.__contains__, folder=Path("captures"))
+    if isinstance(kind, bool):
+        assert trials_module.is_asynchronous(captures) == kind
+    else:
+        with pytest.raises(SpecError, match=kind):
+            trials_module.is_asynchronous(captures)
+    if reference is not None:
+        sensor.evs = None
+        assert not trials_module.is_asynchronous(SimpleNamespace(**{**vars(captures), "has": lambda name: False}))
+
+
+def test_the_spread_of_thresholds_is_that_of_two_quantiles_less_counting():
+    """Of 300 pixels with 400 trials: the lowest quantile with ten events and the next one, of each polarity."""
+    rng, trials = np.random.default_rng(5), 400
+    both = [rng.binomial(trials, norm.sf(u * (1 + 0.08 * rng.standard_normal(300)))) for u in (1.5, 2.1)]
+    middles, spread = medians.middle_and_spread(both, np.zeros(300, np.intp), trials)
+    z, parts = list(medians.QUANTILES.values()), list(medians.QUANTILES)
+    jittered = [counts + np.random.default_rng(0).uniform(-0.5, 0.5, 300) for counts in both]
+    q = np.array([np.quantile(counts, parts) for counts in jittered])
+    k = int(np.argmax(q.min(axis=0) >= 10))
+    values = []
+    for own in q:
+        low, high = norm.isf((own[[k, k + 1]] + 0.5) / (trials + 1))
+        m = (low - high) / (high * z[k] - low * z[k + 1])
+        p = own[[k, k + 1]] / trials
+        counting = np.mean(p * (1 - p) / trials / norm.pdf([low, high]) ** 2)
+        values.append(m**2 - counting / (low / (1 + m * z[k])) ** 2)
+    assert k + 1 < len(parts)
+    assert spread == pytest.approx(np.sqrt(np.median(values))) and spread == pytest.approx(0.08, abs=0.03)
+    assert [float(one[0]) for one in middles] == pytest.approx([1.5, 2.1], rel=0.05)
