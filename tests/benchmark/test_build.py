@@ -18,7 +18,7 @@ import hesim_render as hr
 from benchmarks import SMALL, generated, small
 from hesim_render import cli
 from hesim_render.benchmark import Benchmark, build_benchmark, local, verify_benchmark
-from hesim_render.benchmark.build import UnfinishedError
+from hesim_render.benchmark.build import REPORT_FILE, UnfinishedError
 from hesim_render.benchmark.card import card, spread
 from hesim_render.benchmark.clip import CLIP_FILE, build_clip, clip_folder
 from hesim_render.benchmark.forecast import estimate_build
@@ -247,11 +247,13 @@ def test_a_clip_that_cannot_be_built_is_reported_and_the_others_are_there(tmp_pa
     def broken(plan, clip, root):
         if clip.split == "test":
             raise SpecError("is broken")
-        return clips.Built(clip.name, 1.0, 1)
+        return clips.Built(clip.name, 1.5, 700)
 
     monkeypatch.setattr("hesim_render.benchmark.worker.build_clip", broken)
     with pytest.raises(UnfinishedError, match="is broken\n1 of 2 clips could not be built"):
         build_benchmark(small(), tmp_path / "b", estimate=False)
+    (run,) = json.loads((tmp_path / "b" / REPORT_FILE).read_text())
+    assert run["bytes"] == 700  # those of the clip that is there
     assert not (tmp_path / "b" / "benchmark.json").exists()
 
 

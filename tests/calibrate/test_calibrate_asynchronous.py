@@ -599,3 +599,37 @@ def test_a_family_of_columns_is_judged_by_the_law_of_hotelling(count):
     assert (found.chi2, found.dof) == (pytest.approx(t2, rel=1e-6), 3)
     chance = f_law.sf(t2 * (count - 3) / (3 * (count - 1)), 3, count - 3)
     assert found.p_value == pytest.approx(chance, rel=1e-5)
+
+
+def test_each_family_of_columns_is_judged_by_itself_and_all_together(monkeypatch):
+    columns = SimpleNamespace(family=np.array([2, 0, 1, 0, 2, 2]))
+    for name, value in (("_columns", columns), ("_ended", "search"), ("_ceiling", None), ("_floor", "wrong")):
+        monkeypatch.setattr(checks, name, lambda *given, value=value: value)
+    monkeypatch.setattr(checks, "_judge", lambda columns, some, fit: some.tolist())
+    monkeypatch.setattr(checks, "_family", lambda name, some: None if name == "times" else (name, some))
+    findings, goodness = checks.check_trials(None, (None, None))
+    parts = {"steps": [1, 3], "times": [2], "steady": [0, 4, 5], "all": [0, 1, 2, 3, 4, 5]}
+    assert goodness == parts
+    assert findings == [("steps", [1, 3]), ("steady", [0, 4, 5]), "search", "wrong"]
+    few = SimpleNamespace(residual=np.zeros((9, 6)), **vars(columns))
+    monkeypatch.undo()
+    # four columns of nine pixels are too many, unless neighbours are added
+    found = checks._judge(few, np.arange(0), None)
+    assert np.isnan(found.chi2) and (found.dof, found.p_value) == (0, 1.0)
+
+
+def test_neighbouring_columns_are_added_where_there_are_many(monkeypatch):
+    """With 5 pixels a column, 10 pixels tell two numbers: sums of the first three columns and of the others."""
+    monkeypatch.setattr(checks, "_PIXELS_PER_COLUMN", 5)
+    residual = np.random.default_rng(5).normal(0.4, 1, (10, 6))
+
+    def judged(values, some):
+        size = np.full(values.shape[1], 1e-3)
+        columns = SimpleNamespace(residual=values, expected=size, silent=size, family=np.zeros(values.shape[1], int))
+        return checks._judge(columns, some, SimpleNamespace(scores=np.zeros((10, 2)), free=slice(None)))
+
+    found = judged(residual, np.arange(6))
+    by_hand = judged(np.stack([residual[:, :3].sum(axis=1), residual[:, 3:].sum(axis=1)], axis=1), np.arange(2))
+    assert found.dof == 2 and found.chi2 == pytest.approx(by_hand.chi2, rel=1e-5)
+    monkeypatch.setattr(checks, "_PIXELS_PER_COLUMN", 3)
+    assert np.isnan(judged(residual, np.arange(6)).chi2)  # three numbers from ten pixels are too many

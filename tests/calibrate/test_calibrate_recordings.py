@@ -154,6 +154,8 @@ def test_the_shortest_time_of_a_moving_target_is_no_dead_time():
     quiet, noisy, moving = (tally(EventStream.of(one, SHAPE)) for one in (quiet, noisy, target))
     found = calibration.figures([quiet], moving, None, 3.0, None)["dead_time_us"]
     assert found["value"] is None and "at most 90" in found["reason"]
+    # a target without its contrast tells no thresholds
+    assert "it takes a recording" in calibration.figures([noisy], moving, None, None, None)["theta_on"]["reason"]
     assert calibration.figures([noisy], moving, None, 3.0, None)["dead_time_us"]["value"] == pytest.approx(61, abs=2)
 
 

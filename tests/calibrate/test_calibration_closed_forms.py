@@ -41,6 +41,7 @@ from hesim_render.calibrate.evs.steps import GROUPS, Steps
 from hesim_render.calibrate.evs.thresholds import Thresholds, curve
 from hesim_render.calibrate.flicker import dynamics
 from hesim_render.calibration.spec import Defect
+from hesim_render.core.errors import SpecError
 
 BETA = np.array([4.0, 0.3, 20.0, 2e-5, 0.05, 30.0])  # 1, I, t, I², I t, t²
 FRAMES, TAU = 16, 6.0
@@ -704,3 +705,78 @@ def test_a_flickering_pixel_has_the_chance_of_the_time_in_which_it_fires():
     assert found.on[5, 7] * found.firing_share[5, 7] == pytest.approx(0.12, rel=0.005) and found.off[5, 7] == 0
     assert 0.9 < found.correlation[5, 7] < 1
     assert np.all(found.on[~bad] == 0) and np.all(found.firing_share[~bad] == 1)
+
+
+def test_without_maps_of_frames_there_is_no_signal_at_event_pixels(tmp_path, monkeypatch):
+    """No calibration yet, none at all, or one of events alone; and pixels whose filter no frame pixel has."""
+    (tmp_path / "events.yaml").write_text("")
+    monkeypatch.setattr(counts, "read_calibration", lambda _: {"evs": {}})
+    captures = SimpleNamespace(folder=tmp_path, spec=SimpleNamespace(signal_reference=None))
+    for calibration in (None, tmp_path / "none.yaml", tmp_path / "events.yaml"):
+        with pytest.raises(SpecError, match="holds no array 'signal_dn'"):
+            counts._composite_signal(captures, calibration, tmp_path / "evs_static.npz")
+
+
+@pytest.mark.parametrize("part", [8, 12, 40])
+def test_parts_of_a_dark_capture_are_eight_or_more_and_add_up(part):
+    rng = np.random.default_rng(1)
+    parts = rng.integers(0, 5, (part, 3, 4))
+    on = parts.sum(axis=0) // 3
+    maps = {"dark_n_on": on, "dark_n_off": parts.sum(axis=0) - on}
+    assert counts._parts({"dark_parts": parts}, maps, 120, "a.npz") is parts
+    for wrong, trials, words in (
+        (parts[:7], 70, "holds 7 parts"), (parts, 119, "a divisor of n_trials"), (parts[:, :2], 120, "whole numbers"),
+        (parts + 1, 120, "does not add up"), (parts * 1.0, 120, "whole numbers"),
+    ):  # fmt: skip
+        with pytest.raises(SpecError, match=words):
+            counts._parts({"dark_parts": wrong}, maps, trials, "a.npz")
+    assert counts._parts({}, maps, 120, "a.npz") is None
+
+
+def test_without_steps_or_the_noise_of_counts_no_widths_are_compared():
+    class Fit(SimpleNamespace):
+        def identified(self, name):
+            return name != self.lacks
+
+    for thresholds, curves, lacks in ((None, 1, "D"), (1, None, "D"), (1, 1, "A"), (1, 1, "B"), (1, 1, "C")):
+        result = SimpleNamespace(thresholds=thresholds, steps=curves, together=Fit(lacks=lacks))
+        assert event_checks._width(result, "voltage") is None
+
+
+def test_ceilings_below_one_are_told_beyond_noise_and_a_thousandth():
+    def told(value, error):
+        return event_checks._ceiling(event_checks.CurveLevels((0.0, 0.0), (0.0, 0.0), (value, error)))
+
+    found = told(0.99, 0.002)
+    assert found.p_value == pytest.approx(norm.sf(5)) and "0.9900 ± 0.002" in found.text
+    assert told(0.99, 0.003) is None and told(0.9991, 1e-6) is None and told(0.9989, 1e-6) is not None
+
+
+def test_floors_are_told_beyond_leak_with_its_error():
+    """ON events beside the leak of the static counts; four comparisons, two of them of events that are too few."""
+    covariance = np.diag([1.0, 1, 1, 1, 1, 4e-8])
+
+    def told(on, off, free=True):
+        fit = SimpleNamespace(values=np.array([1, 1, 1, 1, 0, 3e-3]), covariance=covariance, free=[True] * 5 + [free])
+        levels = event_checks.CurveLevels(on, off, (1.0, 0.1))
+        return event_checks._floor(SimpleNamespace(together=fit), levels)
+
+    assert told((3.4e-3, 1e-4), (0.0, 1e-4)) is None  # 1.8 errors, of both together
+    found = told((5e-3, 3e-4), (9e-4, 1e-4))
+    errors = 2e-3 / np.hypot(3e-4, 2e-4), 9.0
+    assert found.p_value == pytest.approx(4 * norm.sf(max(errors))) and "0.005 (ON) and 0.0009 (OFF)" in found.text
+    assert told((3e-3, 3e-4), (0.0, 1e-4), False).p_value == pytest.approx(4 * norm.sf(10))
+    assert told((-1e-2, 1e-5), (-1e-2, 1e-5)) is None and told((3e-3 + 9e-6, 0.0), (9e-6, 0.0), True) is None
+
+
+def test_searches_that_end_elsewhere_are_told_where_they_describe_the_counts():
+    values = np.array([[1.0, 2, 3, 4], [1.0, 2, 3, 4], [1.0, 2, 3, 4], [1.2, 2, 3, 4], [9.0, 2, 3, 4], [1.0, 2, 3, 40]])
+    ends = SimpleNamespace(
+        standard_error=np.array([0.5, 0.1, 0.1, 0.1]), values=values,
+        describe_counts=lambda per_dof: np.array([1, 1, 1, 1, 0, 1], bool),
+    )  # fmt: skip
+    fit = SimpleNamespace(free=(True, True, True, False, False, False), goodness=SimpleNamespace(per_dof=1.0))
+    found = event_checks._starts(SimpleNamespace(ends=ends, together=fit))
+    assert "1 of 5 searches" in found.text and "up to 0.4 standard errors" in found.text
+    values[3, 0] = 1.14
+    assert event_checks._starts(SimpleNamespace(ends=ends, together=fit)) is None  # 0.28 errors

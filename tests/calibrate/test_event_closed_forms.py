@@ -8,7 +8,8 @@ from scipy.special import ndtr
 from scipy.stats import norm
 
 from hesim_render.calibrate.asynchronous import fit as trials_fit
-from hesim_render.calibrate.evs import dispersion, thresholds
+from hesim_render.calibrate.asynchronous import likelihood
+from hesim_render.calibrate.evs import analysis, dispersion, thresholds
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_probability
 
@@ -236,3 +237,46 @@ def test_middle_spread_and_leak_of_a_start():
         calm=np.array([[10, 10], [30, 50], [90, 90]]), edges_s=np.array([0.0, 0.1, 0.25]),
     )  # fmt: skip
     assert trials_fit._leak_start(steady) == pytest.approx(11.5 / (80 * 0.25))
+
+
+def test_errors_of_resampling_are_those_of_fits_to_weighted_pixels(monkeypatch):
+    """Each pixel that is not bad counts as often as a Poisson law of mean 1 says; those of weight 0 are left out."""
+    bad = np.array([False, True, False, False, False, False])
+    asked = []
+
+    def pool(static, some, known, steps, weight):
+        assert (static, known, steps) == ("static", "known", None)
+        np.testing.assert_array_equal(some, ~bad & (weight > 0))
+        asked.append(weight)
+        return weight
+
+    def fit(pixels, theta_v, law, parameters, free):
+        assert (theta_v, law, parameters, free) == (0.4, "sqrt", "p", "f")
+        return SimpleNamespace(values=np.array([*(pixels[:4] * [1.0, 3.0, 10.0, 0.5]), 99.0]))
+
+    monkeypatch.setattr(analysis, "pool_events", pool)
+    monkeypatch.setattr(analysis, "fit_events", fit)
+    together = SimpleNamespace(law="sqrt", parameters="p", free="f")
+    result = SimpleNamespace(bad=bad, together=together, static="static", known="known", theta_v=0.4)
+    error = analysis.bootstrap_errors(result, 5, 7)
+    drawn = np.random.default_rng(8).poisson(1.0, (5, 6))
+    np.testing.assert_array_equal(asked, drawn)
+    np.testing.assert_allclose(error, np.std(drawn[:, :4], axis=0, ddof=1) * [1.0, 3.0, 10.0, 0.5])
+
+
+@pytest.mark.parametrize(("law", "power"), [("sqrt", 1), ("linear", 2)])
+def test_the_noise_of_trials_is_a_thousandth_of_the_threshold_or_more(law, power):
+    values = np.zeros(9)
+    values[[0, 1, likelihood.RESPONSE]] = 0.3, 0.9, 0.05
+    light = np.array([0.0, 30.0])
+    np.testing.assert_allclose(likelihood.noise_of(values, light, law), 3e-4)
+    values[[likelihood.SHOT, likelihood.DARK]] = 2e-6, 7e-6
+    own = (2e-6 * light**power + 7e-6) / (1 + 0.05 * light) ** 2
+    np.testing.assert_allclose(likelihood.noise_of(values, light, law), np.sqrt(own + 9e-8))
+
+
+@pytest.mark.parametrize(("mismatch", "reach"), [(0.1, (0.4, 1.6)), (0.2, (0.03, 2.2)), (0.001, (0.95, 1.05))])
+def test_grids_of_thresholds_reach_six_spreads_on_both_sides(mismatch, reach):
+    grid = likelihood.threshold_grid(0.4, mismatch)
+    assert grid.size == 97 and (grid[0], grid[-1]) == pytest.approx((0.4 * reach[0], 0.4 * reach[1]))
+    np.testing.assert_allclose(np.diff(grid), 0.4 * (reach[1] - reach[0]) / 96)

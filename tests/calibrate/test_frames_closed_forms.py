@@ -7,8 +7,10 @@ import pytest
 import yaml
 from scipy.stats import chi2, norm
 
-from hesim_render.calibrate.aps import checks, composite, dark, sensor_file, telegraph
+from hesim_render.calibrate.aps import calibration as frame_calibration
+from hesim_render.calibrate.aps import checks, common_mode, composite, dark, sensor_file, telegraph, variance
 from hesim_render.calibrate.estimate import ALARM
+from hesim_render.core.errors import SpecError
 
 
 def test_lines_of_pixels_that_lack_exposures_are_those_of_polyfit():
@@ -261,3 +263,120 @@ def test_the_sensor_file_of_captures_has_their_figures(tmp_path, seen, limit):
     result.saturation = 2  # never seen
     data = yaml.safe_load(sensor_file.write_sensor(file, tmp_path / "c.yaml", result).read_text(encoding="utf-8"))
     assert data["aps"]["full_well_e"] == pytest.approx(1.25 * 1023 / 0.4, rel=1e-5)
+
+
+def test_suspects_are_judged_by_the_exposures_that_are_clear_of_both_ends():
+    """χ² over 8 − 1 degrees of freedom of each exposure that counts."""
+    rows, cols, frames, full = 12, 9, 8, 255
+    rng = np.random.default_rng(3)
+    clear = rng.random((3, rows, cols)) < 0.7
+    freedom = 7 * clear.sum(axis=0)
+    beyond = rng.uniform(0.85, 1.15, (rows, cols))
+    # the dark current is zero and every other variance is 5: that is what a good pixel has
+    variance = np.full((3, rows, cols), 5.0)
+    odd = np.zeros((rows, cols), bool)
+    odd[1::3, 1::3] = True
+    limit = chi2.isf(1e-6, np.maximum(freedom, 1))
+    variance[:, odd] = (beyond * limit * 5.0 / np.maximum(freedom, 1))[odd]
+    low = rng.random(clear.shape) < 0.5
+    moments = SimpleNamespace(
+        lowest=np.where(clear | ~low, 1, 0), highest=np.where(clear | low, full - 1, full), variance=variance,
+        mean=np.full((3, rows, cols), 20.0), exposures_s=np.array([0.1, 0.4, 1.2]), frames=frames,
+    )  # fmt: skip
+    used = np.ones((rows, cols), bool)
+    expected = odd & (beyond > 1) & (freedom > 0)
+    assert expected.sum() >= 3 and (odd & (beyond < 1)).sum() >= 2
+    np.testing.assert_array_equal(telegraph._suspects(moments, used, (1, 3), full), expected)
+    used[tuple(np.argwhere(expected)[0])] = False
+    np.testing.assert_array_equal(telegraph._suspects(moments, used, (1, 3), full), expected & used)
+
+
+def test_only_the_most_suspicious_pixels_are_examined(monkeypatch):
+    monkeypatch.setattr(telegraph, "_MOST", 2)
+    shape = 2, 5, 7
+    variance = np.full(shape, 5.0)
+    variance[:, [0, 2, 4], [3, 1, 6]] = 70.0, 90.0, 80.0
+    moments = SimpleNamespace(
+        lowest=np.ones(shape), highest=np.full(shape, 9), variance=variance, mean=np.zeros(shape),
+        exposures_s=np.array([0.1, 0.4]), frames=8,
+    )  # fmt: skip
+    found = telegraph._suspects(moments, np.ones(shape[1:], bool), (1, 1), 255)
+    assert np.argwhere(found).tolist() == [[2, 1], [4, 6]]
+
+
+def test_one_row_has_no_row_noise_that_shows():
+    used = np.zeros((4, 6), bool)
+    used[2] = True
+    found = common_mode.row_noise(None, used)
+    assert found == common_mode.Shared(0.0, float("inf"), 1.0, 1.0)
+
+
+def test_variances_that_rounding_hides_fit_nothing():
+    rng = np.random.default_rng(2)
+    bins = variance.Pooled(
+        np.full(3, 0.1), np.zeros(3), np.full((3, 7), 50.0), np.full((3, 4), 4.0), rng.random(3), np.zeros(3),
+        np.full(3, 9.0), np.ones(3, bool),
+    )  # fmt: skip
+    found = variance.fit_variance(bins, least_dn2=0.081)  # 4/50 DN²
+    assert not found.identified.any() and not found.beta.any() and found.covariance.shape == (6, 6)
+    assert found.quantised_pixels == 150 and found.p_value == found.expected_chi2 == 1 and found.dof == 0
+
+
+def test_sensors_without_event_pixels_have_no_signal_at_them():
+    sensor = SimpleNamespace(tile_rows=["ab"], evs_grid=None)
+    rate = SimpleNamespace(rate_dn_per_s=np.ones((4, 4)), standard_error_dn_per_s=np.ones((4, 4)))
+    signal, uneven = composite.signal_at_event_pixels(rate, sensor)
+    assert signal.shape == uneven.shape == (0, 0) and signal.dtype == np.float32 and uneven.dtype == np.bool_
+
+
+def test_pixels_are_unlike_their_kind_by_the_scatter_of_their_variances():
+    """Σ (n − 1)(s²/σ² − 1) over what is clear, over √(2 Σ (n − 1)): eight robust widths decide, or eight errors."""
+    rng, shape = np.random.default_rng(6), (14, 18)
+    beta = np.array([[[3.0, 0.02, 0.5, 0, 0, 0], [5.0, 0.03, 0.2, 0, 0, 0]]])
+    sets, sums, freedom = [], np.zeros(shape), np.zeros(shape)
+    odd = rng.random(shape) < 0.1
+    factor = np.where(odd, rng.uniform(2.5, 5.0, shape), 1.0)
+    for frames, times, light in ((6, [0.1, 0.7], 0.0), (11, [0.2, 0.5, 0.9], 300.0)):
+        signals = light * rng.uniform(0.5, 1, (len(times), *shape))
+        mask = rng.random(signals.shape) < 0.8
+        variance = np.empty(signals.shape)
+        for k, t in enumerate(times):
+            terms = np.array([np.ones(shape), signals[k], np.full(shape, t)])
+            tiled = np.tile(beta[0, :, :3], (shape[1] // 2, 1)).T[:, None]
+            expected = np.sum(tiled * terms, axis=0) + 1 / 12
+            variance[k] = expected * factor * rng.chisquare(frames - 1, shape) / (frames - 1)
+            sums += mask[k] * (frames - 1) * (variance[k] / expected - 1)
+            freedom += mask[k] * (frames - 1)
+        moments = SimpleNamespace(exposures_s=np.array(times), variance=variance, frames=frames, mean=variance)
+        sets.append((moments, mask, signals))
+    (dark, dark_clear, _), (lit, usable, signals) = sets
+    scaled = sums / np.sqrt(2 * np.maximum(freedom, 1))
+    width = 1.4826 * np.median(np.abs(scaled - np.median(scaled)))
+    expected = np.abs(scaled) > 8 * max(1.0, width)
+    assert expected.sum() > 5 and (odd & ~expected).sum() > 5
+    found = frame_calibration._unlike_their_kind(beta, dark, lit, signals.astype(np.float32), dark_clear, usable)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_light_is_there_from_five_deviations_of_a_mean_on_and_until_98_per_cent_are_saturated():
+    """The longest exposure: √(36/9 + 5) = 3 DN, median of the good pixels."""
+    good = np.arange(400).reshape(20, 20) % 5 > 0
+    variance = np.where(good, 36.0, 900.0)[None] * np.array([0.1, 1.0])[:, None, None]
+    lit = SimpleNamespace(
+        highest=np.full((2, 20, 20), 200), variance=variance, frames=9, exposures_s=np.array([0.1, 0.4])
+    )  # fmt: skip
+    dark = SimpleNamespace(mean_variance=lambda t: {0.1: 0.0, 0.4: 5.0}[t])
+
+    def check(level):
+        signals = np.stack([np.full((20, 20), 900.0), np.where(good, level, 900.0)])
+        frame_calibration._check_light(dark, lit, signals, good, 255)
+
+    check(15.1)
+    with pytest.raises(SpecError, match="no light above the dark"):
+        check(14.9)
+    lit.highest[:] = 255
+    lit.highest[0][good & (np.arange(400).reshape(20, 20) < 18)] = 200  # 14 of 640
+    check(15.1)
+    lit.highest[0, 0] = 255
+    with pytest.raises(SpecError, match="saturated at every exposure"):
+        check(15.1)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.stats import chi2 as chi2_law
+from scipy.stats import gamma
 
 from hesim_render.calibrate.aps import light_curve, noise_spectrum, spatial
 from hesim_render.calibrate.aps.pair_levels import Levels, pair_statistics
@@ -274,3 +275,42 @@ def test_only_frequencies_that_stand_out_of_an_image_are_its_waves():
     # interference of that size at that frequency is noise of the mean of 12 frames: what is left of it is no wave
     hum = noise_spectrum.InterferenceLine(7 / rows, 13 / cols, 1.1 / np.sqrt(2) * np.sqrt(12))
     np.testing.assert_array_equal(spatial._waves(pixels + sine, noise, SimpleNamespace(lines=[hum]), 12), 0)
+
+
+def test_a_line_at_one_place_is_a_weighted_mean_without_a_slope():
+    y, error = np.array([3.0, 5.0, 8.0]), np.array([0.1, 0.2, 0.4])
+    found = light_curve.straight(np.full(3, 7.0), y, error)
+    weight = 1 / error**2
+    mean = np.average(y, weights=weight)
+    scale = light_curve._scale(float(np.sum(weight * (y - mean) ** 2)) / 2, 2)
+    assert (found.value, found.error) == pytest.approx((mean, np.sqrt(scale / weight.sum())))
+    assert found.slope == 0 and np.isnan(found.slope_error) and found.groups == 3
+    assert found.rms == pytest.approx(np.sqrt(np.sum((y - mean) ** 2) / 2))
+    np.testing.assert_allclose(found.error_at(np.array([2.0, 90.0])), found.error)
+    x = np.array([1.0, 2.0, 4.0])
+    line = light_curve.straight(x, y, error)
+    np.testing.assert_allclose([line.slope, line.value], np.polyfit(x, y, 1, w=1 / error))
+    assert line.error_at(np.zeros(1))[0] == pytest.approx(line.error) and line.groups == 2
+
+
+def test_the_spectrum_of_frames_has_one_degree_of_freedom_less_than_frames(monkeypatch):
+    """Three frames: power over two, a floor of two, and lines beyond the gamma law of two; by a plain transform."""
+    stack = np.random.default_rng(5).normal(0, 2.0, (3, 20, 27)) + 100
+    asked = []
+
+    def floor(inside, shape, frames, highest):
+        asked.append((inside, shape, frames, highest))
+        return np.full(inside.shape, 4.0)
+
+    class Stack(list):
+        shape = (1, 3, 20, 27)
+
+    monkeypatch.setattr(noise_spectrum, "_floor", floor)
+    found = noise_spectrum.noise_spectrum(Stack(stack), stack.mean(axis=0))
+    ((inside, shape, frames, highest),) = asked
+    power = np.sum(np.abs(np.fft.fft2(stack - stack.mean(axis=0))) ** 2, axis=0) / (2 * 20 * 27)
+    np.testing.assert_allclose(inside, power[1:, 1:14])
+    assert shape == (20, 27) and frames == 2 and highest == pytest.approx(gamma.isf(1e-4 / (19 * 13), 2) / 2)
+    assert found.lines == [] and found.correlation_error == pytest.approx(1 / np.sqrt(2 * 20 * 27))
+    turn = np.cos(2 * np.pi * np.arange(1, 14) / 27)
+    assert found.correlation == pytest.approx(np.sum(inside * turn) / inside.sum() + 1 / 26)

@@ -249,3 +249,92 @@ def test_the_readout_limit_is_the_mean_of_the_fullest_windows():
     assert readout_limit([one])[0]["value"] is not None
     windows[[198, 199, 200]] = 4, 10, 5  # 19 are too few
     assert "it is at least 2e+05 events/s" in readout_limit([one])[0]["reason"]
+
+
+def test_a_target_whose_cycles_do_not_show_tells_no_thresholds():
+    count = np.full((2, 3 * target.GROUPS), 40.0)
+    tally = SimpleNamespace(
+        per_pixel=lambda: count, period_s=lambda: None, seconds=3.0, group=np.arange(count.shape[1])
+    )
+    found = target.thresholds(tally, 2.0, None)
+    assert "a pixel sees 0 cycles of the target, with 0 events of a polarity" in found.ratio["reason"]
+    few = target.thresholds(tally, 2.0, 0.9)
+    assert "a pixel sees 2.7 cycles of the target, with 14.8 events" in few.entries["theta_on"]["reason"]
+    # leak adds half a threshold a second to the rise, and hides as much of the fall
+    leaky = target.thresholds(tally, 2.0, 0.9, 4.0)
+    assert "with 12.6 events" in leaky.ratio["reason"]
+    count[:, 2 * target.GROUPS - 1 :] = 0
+    assert f"{2 * target.GROUPS} are needed" in target.thresholds(tally, 2.0, 5.0).ratio["reason"]
+
+
+def test_leaks_are_those_of_all_pixels_with_jackknife_errors():
+    """The first column is of all groups, the others leave one out; the unknown part is a square beside them."""
+    rng = np.random.default_rng(4)
+    leak = rng.uniform(1, 2, (2, 1)) + 0.05 * rng.standard_normal((2, 1 + GROUPS))
+    unknown = np.array([0.11, 0.3])
+    found = still._with_ratio(leak, unknown, None, {"value": 1.2})
+    for entry, row, unsure in zip(found.leaks, leak, unknown, strict=True):
+        parts = row[1:]
+        scatter = np.sqrt((GROUPS - 1) / GROUPS * np.sum((parts - parts.mean()) ** 2))
+        assert entry["value"] == pytest.approx(row[0]) and entry["unit"] == "Hz"
+        assert entry["standard_error"] == pytest.approx(np.hypot(scatter, unsure))
+    assert found.ratio == {"value": 1.2}
+
+
+def test_a_tenth_of_the_leak_is_an_error_of_the_thresholds_of_a_target(monkeypatch):
+    """12 thresholds of leak: half of them in 40 ON events, and 15/28 of as many missing in 30 OFF events."""
+    seen, scatter = [], np.diag([1e-4, 4e-4, 1e-6])
+
+    class Simulated:
+        def __init__(self, rise, cycles):
+            seen.append((rise, cycles))
+
+        def fit(self, wanted):
+            seen.append(wanted)
+            return np.array([0.21, 0.34, 0.09]), np.diag([2.0, 4.0, 1.0])
+
+        def moment_covariance(self, values):
+            return scatter
+
+    monkeypatch.setattr(target, "_Simulated", Simulated)
+    count = np.array([[40.0], [30.0]]) * np.ones(4 * target.GROUPS)
+    tally = SimpleNamespace(per_pixel=lambda: count, seconds=3.0, group=np.arange(count.shape[1]) % target.GROUPS)
+    found = target.thresholds(tally, 2.0, 4.0, 4.0)
+    assert seen[0] == (pytest.approx(np.log(2)), 12)
+    assert seen[1] == pytest.approx([(40 - 6) / 12, (30 + 12 * 15 / 28) / 12, 0])
+    unsure = 0.1 * 12 * np.array([0.5 / 40, 15 / 28 / 30])
+    for name, theta, leak, own in (("theta_on", 0.21, unsure[0], 1e-2 / 2), ("theta_off", 0.34, unsure[1], 2e-2 / 4)):
+        assert found.entries[name]["value"] == pytest.approx(theta)
+        assert found.entries[name]["standard_error"] == pytest.approx(np.hypot(theta * leak, own))
+    spread = found.entries["threshold_mismatch_rel"]
+    assert (spread["value"], spread["standard_error"]) == pytest.approx((0.3, 1e-3 / 0.6))
+    ratio, relative = 0.34 / 0.21, np.sqrt(unsure.sum() ** 2 + (5e-3 / 0.21) ** 2 + (5e-3 / 0.34) ** 2)
+    assert (found.ratio["value"], found.ratio["standard_error"]) == pytest.approx((ratio, ratio * relative))
+
+
+def test_simulated_moments_have_the_covariance_of_their_groups():
+    simulated = target._Simulated(2.1, 3)
+    values = np.array([0.22, 0.31, 0.08**2])
+    count = simulated._counts(values)
+    every = []
+    for k in range(GROUPS):
+        own = count[:, k::GROUPS]
+        every.append([own[0].mean(), own[1].mean(), np.mean(own.var(axis=1, ddof=1) / own.mean(axis=1) ** 2)])
+    np.testing.assert_allclose(simulated.moment_covariance(values), np.cov(np.transpose(every)) / GROUPS)
+
+
+def test_simulated_pixels_turn_at_the_ends_of_the_swing(monkeypatch):
+    """A loop over nine pixels: levels begin anywhere in the swing, and the first four cycles are not counted."""
+    monkeypatch.setattr(target, "_PIXELS", 9)
+    simulated = target._Simulated(1.7, 3)
+    counts = simulated._counts(np.array([0.31, 0.23, 0.15**2]))
+    assert sorted(simulated._start) == pytest.approx((np.arange(9) + 0.5) / 9)
+    for k in range(9):
+        on, off = 0.31 * (1 + 0.15 * simulated._z[0, k]), 0.23 * (1 + 0.15 * simulated._z[1, k])
+        level, ups, downs = 1.7 * simulated._start[k], 0, 0
+        for cycle in range(7):
+            while level + on <= 1.7 + 1e-9:
+                level, ups = level + on, ups + (cycle >= 4)
+            while level - off >= -1e-9:
+                level, downs = level - off, downs + (cycle >= 4)
+        assert counts[:, k] == pytest.approx([ups / 3, downs / 3])

@@ -1,5 +1,6 @@
 """Counts of event pixels: cells by a loop, tails of defects, rates of first events, losses and floors by hand."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,12 +9,15 @@ from scipy.stats import norm, poisson
 
 from hesim_render.calibrate.asynchronous import analysis, defects
 from hesim_render.calibrate.asynchronous import checks as trial_checks
+from hesim_render.calibrate.asynchronous import trials as trials_module
 from hesim_render.calibrate.asynchronous.likelihood import LEAK, NAMES, RESPONSE
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
-from hesim_render.calibrate.evs import fitted, medians
+from hesim_render.calibrate.evs import fitted, medians, steps
+from hesim_render.calibrate.evs import goodness as good_fit
 from hesim_render.calibrate.evs.cells import Cells, PixelThresholds, brightness_edges, pool_events
 from hesim_render.calibrate.evs.model import log_likelihood, log_probability
 from hesim_render.calibration.spec import Defect
+from hesim_render.core.errors import SpecError
 
 
 @pytest.mark.parametrize("position", [None, 1])
@@ -302,3 +306,187 @@ def test_the_mismatch_of_both_polarities_is_weighed_by_their_covariance(on, off)
     whole[np.ix_(k, k)] = np.nan
     found = analysis._mismatch(SimpleNamespace(values=values, covariance=whole))
     assert (found.value, found.limit) == (0, max(on, off)) and np.isnan(found.error)
+
+
+def test_pixels_are_unlike_the_fit_by_any_test_that_few_fail(monkeypatch):
+    """Chunks of three of the eight good pixels; a test that more than a quarter fails tells of the fit, and is left."""
+    monkeypatch.setattr(defects, "_CHUNK", 3)
+    monkeypatch.setattr(defects, "_MOST_BAD", 0.25)
+    good = np.array([1, 1, 0, 1, 1, 1, 0, 1, 1, 1], bool)
+    failed = {1: np.zeros((3, 10), bool), -1: np.zeros((3, 10), bool)}
+    failed[1][0, [0, 9]] = True
+    failed[1][2, [1, 3, 4]] = True
+    failed[-1][1, 5] = failed[-1][2, 2] = True
+    chunks = []
+
+    def tests(fit, steady, steps, polarity):
+        assert fit == "fit" and np.array_equal(steady, steps)
+        chunks.append(len(steps))
+        return failed[polarity][:, steps]
+
+    monkeypatch.setattr(defects, "_tests", tests)
+    trials = SimpleNamespace(of=lambda some: some)
+    assert np.flatnonzero(defects.unlike("fit", trials, trials, good)).tolist() == [0, 5, 9]
+    assert chunks == [3, 3, 3, 3, 2, 2]
+
+
+@pytest.mark.parametrize("weighed", [False, True])
+def test_goodness_is_the_quadratic_form_of_groups_with_their_own_scatter(weighed, monkeypatch):
+    """Two sessions of 60 pixels in four groups, two wide ones; ON and OFF are correlated, and the dark is one group."""
+    rng = np.random.default_rng(12)
+    means = rng.uniform(3, 40, (4, 60)) * np.array([[1.0], [2.0], [0.1], [0.3]])
+    noise = rng.normal(size=(4, 60))
+    noise[1] = 0.6 * noise[0] + 0.8 * noise[1]
+    counts = means + 1.4 * np.sqrt(means) * noise
+    group, wide = np.arange(60) % 4, np.array([0, 1, 1, 0])
+    weight = rng.integers(0, 3, 60) if weighed else None
+    pixels = SimpleNamespace(
+        is_dark=np.array([False, False, True, True]), cells=SimpleNamespace(trials=50), counts=counts,
+        single=lambda k: k, signal_dn=np.arange(60.0), weight=weight,
+    )  # fmt: skip
+    asked = []
+
+    def wider(events):
+        asked.append(events)
+        return wide if events.size == 4 else np.zeros(events.size, int)
+
+    monkeypatch.setattr(good_fit, "probability", lambda values, k, theta_v, law: means[k] / 50)
+    monkeypatch.setattr(good_fit, "_groups", lambda signal, events: asked.append(events) or group)
+    monkeypatch.setattr(good_fit, "_wider", wider)
+    found = good_fit.goodness(pixels, np.zeros(6), 0.3, "sqrt", 5)
+    each = np.ones(60) if weight is None else weight
+    chi2 = 0.0
+    for on, off, number, wider in ((0, 1, group, wide), (2, 3, 0 * group, np.zeros(1, int))):
+        residual = counts[[on, off]] - means[[on, off]]
+        effect = max(1.0, *(np.sum(residual**2, axis=1) / means[[on, off]].sum(axis=1)))
+        alike = [number == g for g in range(number.max() + 1)]
+        expected = np.array([[(each * means[k])[some].sum() for some in alike] for k in (on, off)])
+        if on == 0:
+            np.testing.assert_allclose(asked[0], np.minimum(means[0], means[1]) / effect)
+        np.testing.assert_allclose(asked[1 if on == 0 else 2], expected.min(axis=0) / effect)
+        for g, some in enumerate(alike):
+            near = np.isin(number, np.flatnonzero(wider == wider[g]))
+            size = expected[:, wider == wider[g]].sum(axis=1)
+            matrix = (each * residual)[:, near] @ residual[:, near].T / np.sqrt(np.outer(size, size))
+            total = (each * residual)[:, some].sum(axis=1) / np.sqrt(expected[:, g])
+            chi2 += total @ np.linalg.solve(matrix, total)
+    assert found.chi2 == pytest.approx(chi2) and found.dof == 2 * 5 - 5
+
+
+def test_counts_of_steps_are_sums_over_groups_of_good_pixels(monkeypatch):
+    """The light may be a number, or a map of which nearly all good pixels are within a tenth."""
+    rng, shape = np.random.default_rng(3), (6, 9)
+    good = rng.random(shape) < 0.7
+    counts = {name: rng.integers(0, 20, (2, *shape)) for name in ("n_on", "n_off")}
+    group = rng.integers(0, steps.GROUPS, shape)
+    light = np.where(good, 50 + 0.04 * np.arange(54).reshape(shape), 900.0)
+    given, contrast = [light], np.array([0.2, -0.3])
+    monkeypatch.setattr(steps, "read_contrast", lambda captures, more: (contrast, given[0], {"n_trials": 40}))
+    monkeypatch.setattr(steps, "single_number", lambda value, *name, **limits: value)
+    monkeypatch.setattr(steps, "step_maps", lambda captures, name, *sizes: counts[name])
+    monkeypatch.setattr(steps, "pixel_groups", lambda shape: group)
+    captures = SimpleNamespace(folder=Path("captures"))
+    found = steps.read_steps(captures, good)
+    for name, sums, total in (("n_on", found.on, found.on_total), ("n_off", found.off, found.off_total)):
+        np.testing.assert_array_equal(total, counts[name].sum(axis=0))
+        for k in range(2):
+            for g in np.unique(group):
+                assert sums[k, g] == counts[name][k][good & (group == g)].sum()
+    assert found.signal_dn == np.median(light[good]) and found.trials == 40
+    assert found.pixels.sum() == good.sum() and found.pixels[group[good][0]] == (good & (group == group[good][0])).sum()
+    given[0] = np.array(77.0)
+    assert steps.read_steps(captures, good).signal_dn == 77
+    for wrong, words in ((light[:5], "is of size"), (np.where(good, 50 + np.arange(54).reshape(shape), 0), "10 %")):
+        given[0] = wrong
+        with pytest.raises(SpecError, match=words):
+            steps.read_steps(captures, good)
+
+
+@pytest.mark.parametrize(("advantage", "law"), [(4.0, "linear"), (6.0, "sqrt"), (900.0, "sqrt"), (-900.0, "linear")])
+def test_trials_are_fitted_to_good_pixels_by_the_law_that_is_likelier(advantage, law, monkeypatch):
+    """Two plainly bad pixels of 90, and a third that is unlike the first fit; the laws are compared on 50 pixels."""
+    plain, other = np.zeros(90, bool), np.zeros(90, bool)
+    plain[[4, 70]] = other[33] = True
+    fits, asked = [], []
+
+    def fit(sets, law, start, rounds=None):
+        fits.append((set(sets[0].tolist()), law, start, rounds))
+        return SimpleNamespace(
+            law=law, values=np.array([float(len(fits))]),
+            covariance=np.eye(9), log_likelihood=advantage if law == "sqrt" else 0.0,
+        )  # fmt: skip
+
+    def unlike(fitted, steady, steps, good):
+        asked.append(good.copy())
+        return other & good
+
+    trials = SimpleNamespace(of=np.asarray)
+    changes = {
+        "read_trials": lambda captures: (trials, trials), "plainly_bad": lambda *_: plain.copy(), "fit_trials": fit,
+        "rough_start": lambda steady, steps, good, law: (law, good.sum()), "unlike": unlike,
+        "_pixel_thresholds": lambda fitted, steady, steps, polarity: (polarity, -polarity), "_mismatch": lambda _: "m",
+        "check_trials": lambda fitted, sets: (["finding"], {"all": len(sets[0])}),
+        "classify": lambda steady, steps, bad: np.flatnonzero(bad).tolist(), "_FEW": 50, "MOST_PIXELS": 80,
+    }  # fmt: skip
+    for name, value in changes.items():
+        monkeypatch.setattr(analysis, name, value)
+    found = analysis.analyse_trials(SimpleNamespace(folder=None), seed=3)
+    glances = fits[:2]
+    assert [one[1] for one in glances] == ["linear", "sqrt"] and all(one[2] == (one[1], 88) for one in glances)
+    assert all(len(one[0]) == 50 and one[3] == analysis._GLANCE for one in glances)
+    assert not glances[0][0] & {4, 70} and glances[0][0] == glances[1][0]
+    close = abs(advantage) < 500
+    assert len(fits) == (6 if close else 4) and [one[1] for one in fits[-2:]] == [law, law]
+    first, second = fits[-2:]
+    assert len(first[0]) == len(second[0]) == 80 and not first[0] & {4, 70} and not second[0] & {4, 70, 33}
+    assert np.flatnonzero(~asked[0]).tolist() == [4, 70] and np.flatnonzero(~asked[1]).tolist() == [4, 33, 70]
+    assert found.defects == [4, 33, 70] and found.advantage == (advantage if law == "sqrt" else -advantage)
+    assert (found.relative, found.noise) == ((1, -1), (-1, 1)) and set(found.fitted.tolist()) == second[0]
+    assert found.goodness == {"all": 80} and found.findings == ["finding"] and found.mismatch == "m"
+    monkeypatch.setattr(analysis, "plainly_bad", lambda *_: np.arange(90) < 46)
+    with pytest.raises(SpecError, match="46 of 90 event pixels"):
+        analysis.analyse_trials(SimpleNamespace(folder=None))
+
+
+@pytest.mark.parametrize(
+    ("reference", "files", "kind"),
+    [
+        (None, {"evs_static"}, False), (None, {"evs_s_curve"}, True), (None, {"evs_noise_rate"}, True),
+        ("last_event", {"evs_s_curve"}, True), ("last_event", set(), True), ("last_event", {"evs_static"}, "reset"),
+        ("previous_sample", {"evs_static"}, False), ("previous_sample", {"evs_noise_rate"}, "fixed ticks"),
+    ],
+)  # fmt: skip
+def test_captures_are_of_trials_by_their_files_or_their_sensor(reference, files, kind, monkeypatch):
+    monkeypatch.setattr(trials_module, "S_CURVE", "evs_s_curve")
+    monkeypatch.setattr(trials_module, "NOISE_RATE", "evs_noise_rate")
+    sensor = None if reference is None else SimpleNamespace(evs=SimpleNamespace(reference=reference))
+    captures = SimpleNamespace(sensor=sensor, has=files.__contains__, folder=Path("captures"))
+    if isinstance(kind, bool):
+        assert trials_module.is_asynchronous(captures) == kind
+    else:
+        with pytest.raises(SpecError, match=kind):
+            trials_module.is_asynchronous(captures)
+    if reference is not None:
+        sensor.evs = None
+        assert not trials_module.is_asynchronous(SimpleNamespace(**{**vars(captures), "has": lambda name: False}))
+
+
+def test_the_spread_of_thresholds_is_that_of_two_quantiles_less_counting():
+    """Of 300 pixels with 400 trials: the lowest quantile with ten events and the next one, of each polarity."""
+    rng, trials = np.random.default_rng(5), 400
+    both = [rng.binomial(trials, norm.sf(u * (1 + 0.08 * rng.standard_normal(300)))) for u in (1.5, 2.1)]
+    middles, spread = medians.middle_and_spread(both, np.zeros(300, np.intp), trials)
+    z, parts = list(medians.QUANTILES.values()), list(medians.QUANTILES)
+    jittered = [counts + np.random.default_rng(0).uniform(-0.5, 0.5, 300) for counts in both]
+    q = np.array([np.quantile(counts, parts) for counts in jittered])
+    k = int(np.argmax(q.min(axis=0) >= 10))
+    values = []
+    for own in q:
+        low, high = norm.isf((own[[k, k + 1]] + 0.5) / (trials + 1))
+        m = (low - high) / (high * z[k] - low * z[k + 1])
+        p = own[[k, k + 1]] / trials
+        counting = np.mean(p * (1 - p) / trials / norm.pdf([low, high]) ** 2)
+        values.append(m**2 - counting / (low / (1 + m * z[k])) ** 2)
+    assert k + 1 < len(parts)
+    assert spread == pytest.approx(np.sqrt(np.median(values))) and spread == pytest.approx(0.08, abs=0.03)
+    assert [float(one[0]) for one in middles] == pytest.approx([1.5, 2.1], rel=0.05)

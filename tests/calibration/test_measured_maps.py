@@ -62,3 +62,20 @@ def test_maps_of_another_size_are_refused_with_the_size_that_fits():
     whole, _ = layout(threshold_on_rel=np.ones((11, 20)))
     with pytest.raises(SpecError, match=r"is of size \(11, 20\), the region captured of \(20, 11\)"):
         relative_threshold(measured_part(whole), "on", 0.07)
+
+
+@pytest.mark.parametrize(("name", "largest"), [
+    ("n_row", 65535), ("n_blc", 65535), ("n_dp", 1e9), ("response", 1e3), ("telegraph_amplitude_dn", 65535),
+    ("telegraph_high_share", 1), ("telegraph_correlation", 1), ("threshold_on_rel", 1e3),
+])  # fmt: skip
+def test_values_of_maps_have_a_largest_size(name, largest):
+    def read(value):
+        whole, sections = layout()
+        of_events = name.startswith("threshold")
+        sections["evs" if of_events else "aps"][name].flat[7] = value
+        part = measured_part(whole)
+        return relative_threshold(part, "on", 0.07) if of_events else (frame_maps(part), telegraph_rates(part))
+
+    read(-largest if name[0] in "nr" else largest)
+    with pytest.raises(SpecError, match=f"map {name} holds values that are not finite, or beyond"):
+        read(1.001 * largest)

@@ -1,11 +1,13 @@
 """``calibrate recording`` and ``compare`` from the command line."""
 
+import contextlib
 import json
 
 import numpy as np
 import pytest
 
 from hesim_render.cli import main
+from hesim_render.cli.console import Console
 from tests.support.bench_pixels import Pixels
 from tests.support.event_files import written
 from tests.support.still_pixels import random_events
@@ -73,3 +75,16 @@ def test_report_prints_its_figures_and_where_they_are(capsys, tmp_path):
     assert json.loads(text)["pages"] >= 2
     status, _, err = call(capsys, "report", tmp_path / "gone", folder, "--out", tmp_path / "more")
     assert status == 2 and "gone" in err
+
+
+def test_the_progress_of_a_comparison_rises_to_its_end(capsys, recordings, monkeypatch):
+    shown = []
+
+    @contextlib.contextmanager
+    def display(self, title):
+        yield lambda done, total, what: shown.append((done / total, what))
+
+    monkeypatch.setattr(Console, "progress", display)
+    assert call(capsys, "compare", *recordings, "--size", "21x15")[0] == 0
+    parts, names = zip(*shown, strict=True)
+    assert parts == pytest.approx((0, 0.4, 0.8)) and names == (*(f"read {file.name}" for file in recordings), "compare")

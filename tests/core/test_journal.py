@@ -115,3 +115,14 @@ def test_mistakes_leave_no_journal_and_full_disks_do(tmp_path):
 def test_long_names_have_a_journal(tmp_path):
     path = interrupted(tmp_path / ("x" * 250))
     assert path.is_file() and len(path.name) < 120
+
+
+def test_a_result_of_another_size_is_not_recalled_and_forgotten(tmp_path):
+    interrupted(tmp_path / "out")
+    with Journal(tmp_path / "out", RUN) as journal:
+        values = np.full(3, 7.0)
+        assert not journal.recall(SECOND, [values]) and values.tolist() == [7, 7, 7]
+        assert not journal.recall(SECOND, [np.zeros(2)])
+        parts = np.zeros(2, np.float32), np.zeros(3, np.float32), np.zeros(3, np.bool_)
+        assert journal.recall(FIRST, parts)
+        assert parts[0].tolist() == [0, 1] and parts[1].tolist() == [2, 3, 4] and parts[2].all()

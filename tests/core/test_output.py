@@ -387,3 +387,19 @@ def test_what_lies_behind_the_end_of_a_file_is_read_as_zeros(tmp_path):
     found = bytearray(b"x" * 7)
     assert disk.readinto(found) == 7 and bytes(found) == b"cde" + bytes(4)
     disk.close()
+
+
+def test_a_process_is_alive_elsewhere_if_another_one_has_its_number():
+    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    assert output._is_alive_elsewhere(child.pid) and not output._is_alive_elsewhere(os.getpid())
+    child.communicate(b"\n")
+    assert not output._is_alive_elsewhere(child.pid)
+
+
+def test_two_folders_are_exchanged_in_one_step(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).touch()
+    assert output._exchange(tmp_path / "a", tmp_path / "b")
+    assert (tmp_path / "a" / "b").exists() and (tmp_path / "b" / "a").exists()
+    assert not output._exchange(tmp_path / "a", tmp_path / "c")

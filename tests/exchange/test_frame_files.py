@@ -8,6 +8,8 @@ import recordings
 import tifffile
 from PIL import Image
 
+from hesim_render.core.errors import SpecError
+from hesim_render.exchange.formats import write_mipi
 from hesim_render.recording.recording import Recording
 
 
@@ -42,3 +44,12 @@ def test_frames_come_back_exactly(name, sensor, tmp_path):
     assert facts["tile_filter"] == made.mosaic.tile_filter and facts["bit_depth"] == made.mosaic.bit_depth
     # the same folder again, asked for
     assert made.export(name, tmp_path / "out", overwrite=True) == folder
+
+
+@pytest.mark.parametrize("shape", [(1 << 16, 2), (2, 1 << 16)])
+def test_frames_of_a_file_of_mipi_have_at_most_65535_rows_and_columns(tmp_path, shape):
+    with pytest.raises(SpecError, match=f"at most 65535 rows and columns, not {shape[1]}x{shape[0]} px"):
+        write_mipi(tmp_path / "a.bin", np.zeros(shape, np.uint16))
+    most = tuple(min(size, 65535) for size in shape)
+    write_mipi(tmp_path / "a.bin", np.zeros(most, np.uint16))
+    assert np.fromfile(tmp_path / "a.bin", "<u2", 2).tolist() == [most[1], most[0]]

@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from hesim_render.core.errors import SpecError
-from hesim_render.exchange import aedat4, open_events, stream
+from hesim_render.exchange import EventStream, aedat4, open_events, stream
 from hesim_render.exchange.aedat4 import FlatTable
 from hesim_render.exchange.dsec import read_events as read_dsec
 
@@ -333,3 +333,29 @@ def test_a_field_that_a_table_leaves_out_has_its_default():
     table = FlatTable(struct.pack("<HHHHii", 8, 8, 4, 0, 8, 42), 8)
     assert [table.number(field, "<i", 7) for field in (0, 1, 5)] == [42, 7, 7]
     assert table.structures(1, np.dtype("u1")).size == 0 and table.text(5) == ""
+
+
+def test_sizes_and_places_within_an_aedat4_file_are_those_of_its_parts(tmp_path, monkeypatch):
+    """Each FlatBuffer says the bytes that follow its size; a packet's structures begin 8 bytes after its table."""
+    monkeypatch.setattr("hesim_render.exchange.aedat4._PACKET_EVENTS", 300)
+    events = many(700, 1 << 20, (48, 64))
+    path = tmp_path / "e.aedat4"
+    with path.open("wb") as file:
+        aedat4.write(EventStream.of(events, (48, 64), path), file, path)
+    data = path.read_bytes()
+    begin = data.index(b"\r\n") + 2
+    (size,) = struct.unpack_from("<I", data, begin)
+    table = struct.unpack_from("<q", data, begin + 4 + struct.unpack_from("<I", data, begin + 4)[0] + 12)[0]
+    place, counts = begin + 4 + size, []
+    while place < table:
+        stream, packed = struct.unpack_from("<ii", data, place)
+        content = lz4.frame.decompress(data[place + 8 : place + 8 + packed])
+        said, root = struct.unpack_from("<I", content)[0], 4 + struct.unpack_from("<I", content, 4)[0]
+        assert stream == 0 and said == len(content) - 4 and content[8:12] == b"EVTS"
+        vector = root + 4 + struct.unpack_from("<I", content, root + 4)[0]
+        counts.append(struct.unpack_from("<I", content, vector)[0])
+        assert len(content) == vector + 4 + 16 * counts[-1]
+        place += 8 + packed
+    assert place == table and counts == [300, 300, 100]
+    ends = lz4.frame.decompress(data[table:])
+    assert struct.unpack_from("<I", ends)[0] == len(ends) - 4 and ends[8:12] == b"FTAB"

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from hesim_render.cli.commands import app
 from hesim_render.core.errors import SpecError
-from hesim_render.exchange import is_event_file, open_events, text_events
+from hesim_render.exchange import is_event_file, open_events, text_events, text_form
 
 ROWS, COLS = 93, 211
 
@@ -180,3 +180,22 @@ def test_import_and_compare_take_text(tmp_path):
     outcome = runner.invoke(app, ["compare", str(path), str(tmp_path / "e.h5"), "--quiet", *size])
     assert outcome.exit_code == 0, outcome.output
     assert not any(one["differs"] for one in json.loads(outcome.stdout)["distances"])
+
+
+def test_columns_are_told_by_times_that_do_not_fall_and_whole_places():
+    rows = [["1", "0.5", "7", "2"], ["0", "0.5", "3", "9"], ["-1", "1.25", "4", "5"], ["1", "0.1"]]
+    assert text_form._fits(rows, (1, 2, 3, 0))
+    assert not text_form._fits(rows, (2, 0, 3, 1))  # 7, 3, 4 is no time
+    assert not text_form._fits([["0.5", "1.5", "2", "1"], *2 * [["0.6", "1", "2", "1"]]], (0, 1, 2, 3))
+    assert not text_form._fits([["0.5", "1", "2.5", "1"], *2 * [["0.6", "1", "2", "1"]]], (0, 1, 2, 3))
+    assert not text_form._fits([["0.5", "1", "2", "7"], *2 * [["0.6", "1", "2", "1"]]], (0, 1, 2, 3))
+    assert not text_form._fits([["a", "1", "2", "1"]], (0, 1, 2, 3)) and not text_form._fits([["1"]], (0, 1, 2, 3))
+    # the last line may be cut off, unless it is the only one
+    assert text_form._fits([["4", "1", "2", "1"], ["3", "1", "2", "1"]], (0, 1, 2, 3))
+    assert text_form._fits([["4", "1", "2", "1"]], (0, 1, 2, 3))
+
+
+def test_arrays_are_events_unless_they_are_a_frame(tmp_path):
+    for name, is_events in (("raw", False), ("aps_raw", False), ("t", True)):
+        np.savez(tmp_path / f"{name}.npz", **{name: np.zeros(3), "x": np.zeros(3)})
+        assert is_event_file(tmp_path / f"{name}.npz") == is_events

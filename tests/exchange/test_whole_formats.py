@@ -1,6 +1,7 @@
 """Events and frames in one file: MCAP read by libraries of others, the npz of H-ESIM, and videos."""
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from test_round_trips import lists_of_events
 import hesim_render as hr
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.exchange import EventStream, mcap_file, mcap_records, open_events
-from hesim_render.recording import movie
+from hesim_render.recording import exports, movie
 from hesim_render.recording.imports import import_recording
 
 QUICK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -188,6 +189,7 @@ def test_videos_are_read_by_opencv(name, tmp_path):
         assert pictures[0].shape[:2] == tuple(5 * size for size in recording.frames[0].raw.shape)
         strongest = pictures[-1].astype(int).max(axis=(0, 1))
         assert strongest.max() > 60
+    assert movie.write_movie(recording, tmp_path / "colour.mp4", "mp4-colour") == 50
     with pytest.raises(RangeError, match="there are no events"):
         recordings.make("reference-bayer").export("mp4-events", tmp_path / "x.mp4")
     with pytest.raises(RangeError, match="there are no frames"):
@@ -275,3 +277,20 @@ def test_parts_of_the_same_time_are_not_all_held(tmp_path, compression):
     assert events["t_us"].tolist() == [1_000_000 * k + 7 for k in range(30)]
     assert set(events["x"]) == {5} and set(events["y"]) == {3}
     assert peak < 50e6
+
+
+@pytest.mark.parametrize(("shape", "has_events"), [((1, 9), True), ((9, 1), True), ((0, 0), False)])
+def test_sensors_of_one_row_have_events_in_their_file(shape, has_events, monkeypatch, tmp_path):
+    written = []
+    monkeypatch.setattr(exports, "event_stream", lambda recording: "events")
+    monkeypatch.setattr(
+        exports.mcap_file, "write", lambda events, frames, code, *more: written.append((events, list(frames), code))
+    )
+    mosaic = SimpleNamespace(tile_code=np.array([[1, 0], [2, 1]]), tile_shape=(2, 2))
+    frame = SimpleNamespace(t_us=70, raw="raw")
+    recording = SimpleNamespace(event_shape=shape, frames=[frame], mosaic=mosaic)
+    exports._write_mcap(recording, tmp_path / "a.mcap", tmp_path / "b.mcap", None)
+    assert written == [("events" if has_events else None, [(70, "raw")], "bayer_grbg16")]
+    for code, tile in (([[1, 0], [1, 2]], (2, 2)), ([[1, 3], [2, 1]], (2, 2)), ([[0, 1, 1, 2]], (1, 4))):
+        mosaic.tile_code, mosaic.tile_shape = np.array(code), tile
+        assert exports.mosaic_encoding(mosaic) == "mono16"

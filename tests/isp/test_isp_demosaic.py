@@ -327,3 +327,12 @@ def test_event_pixels_of_every_shipped_tile_are_those_of_the_sensor_files():
 
     for name, tile in (("eiger", EIGER), ("gen2", GEN2), ("mipi-hybridevs", MIPI), ("reference-bayer", BAYER)):
         np.testing.assert_array_equal(describe(load_sensor(name)).tile_channel, tile)
+
+
+def test_samples_that_do_not_determine_every_plane_have_the_pseudo_inverse():
+    rng = np.random.default_rng(3)
+    full = rng.normal(size=(5, 5))
+    regular = full @ full.T + np.eye(5)
+    np.testing.assert_allclose(kriging._inverse(regular) @ regular, np.eye(5), atol=1e-9)
+    for singular in (full[:, :3] @ full[:, :3].T, np.zeros((4, 4))):
+        np.testing.assert_allclose(kriging._inverse(singular), np.linalg.pinv(singular, rcond=1e-9), atol=1e-8)

@@ -1,5 +1,7 @@
 """Noise reduction: what it knows of the noise against the simulator's frames, what it keeps, what it gains."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from isp_images import BAYER, EIGER, MIPI, QUAD, images, mosaic_of
@@ -9,6 +11,7 @@ import hesim_render as hr
 from hesim_render.core import bands
 from hesim_render.core.errors import RangeError
 from hesim_render.isp import FrameNoise, collaborate, rows
+from hesim_render.isp import denoise as denoising
 from hesim_render.isp.denoise import _each, denoise
 from hesim_render.isp.rows import row_offsets
 from hesim_render.isp.stabilise import Stabiliser
@@ -351,3 +354,51 @@ def test_noise_times_a_factor_has_that_factor_in_every_standard_deviation():
     assert more[0] - rounding == pytest.approx(6.25 * (once[0] - rounding), rel=1e-12)
     assert once[0] == pytest.approx(0.64 + 3.0 * 0.02 + 11.0 * 0.02**2 + 1.3 + rounding, rel=1e-12)
     np.testing.assert_allclose(more[1:], 6.25 * np.array(once[1:]), rtol=1e-12)
+
+
+def test_patches_that_begin_within_a_block_have_the_colours_of_their_own_places(monkeypatch):
+    """A block of 5 by 7 samples: the second patches begin at its row 2 and column 3; a mean of both is weighted."""
+    block = np.random.default_rng(2).integers(-1, 3, (5, 7))
+    stable = np.arange(15 * 21, dtype=np.float32).reshape(15, 21)
+    monkeypatch.setattr(denoising, "block_of", lambda tile: block)
+    begins = []
+
+    def blocks(image, turned, amplitude):
+        row, col = divmod(int(image[0, 0]), 21)
+        begins.append((row, col))
+        for i, j in np.ndindex(block.shape):
+            assert turned[i, j] == block[(i + row) % 5, (j + col) % 7]
+        return SimpleNamespace(values=len(begins))
+
+    def one_pass(given, known):
+        assert known is None
+        weight = np.float32([0.5, 1.5][given.values - 1])
+        return np.full((2, 3, 4), 10 * given.values * weight), np.full((2, 3), weight)
+
+    monkeypatch.setattr(denoising, "_blocks", blocks)
+    monkeypatch.setattr(denoising.collaborate, "one_pass", one_pass)
+    monkeypatch.setattr(denoising, "_image", lambda values, turned, shape: np.full(shape, values[0, 0, 0]))
+    found = denoising._over_phases(stable, None, None, None)
+    assert begins == [(0, 0), (2, 3)]
+    expected = np.full((15, 21), 10.0)
+    expected[2:, 3:] = (5 + 30) / 2
+    np.testing.assert_allclose(found, expected)
+
+
+def test_means_of_blocks_are_samples_a_block_apart(monkeypatch):
+    """Blocks of 6 by 4 px: 2 × 2 of their means are a block of samples, whose places are those of the picture."""
+    seen = []
+
+    def one_pass(blocks, known):
+        seen.append((blocks, known))
+        return 3.0 * blocks.values, np.full(blocks.values.shape[:2], 1.5, np.float32)
+
+    monkeypatch.setattr(denoising.collaborate, "one_pass", one_pass)
+    means = np.random.default_rng(1).normal(size=(2, 8, 10)).astype(np.float32)
+    found = denoising._reduced_means(means, (6, 4), np.array([5.0, 9.0]))
+    blocks, known = seen[0]
+    np.testing.assert_array_equal(blocks.at, [[0, 0], [0, 4], [6, 0], [6, 4]] * 2)
+    assert blocks.size == (12, 8) and known is None and len(seen) == 2
+    assert blocks.channel.tolist() == [0] * 4 + [1] * 4 and blocks.amplitude.tolist() == [5.0] * 4 + [9.0] * 4
+    np.testing.assert_allclose(seen[1][1], 2 * blocks.values, rtol=1e-6)
+    np.testing.assert_allclose(found, 2 * means, rtol=1e-6)

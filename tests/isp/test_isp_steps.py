@@ -9,7 +9,7 @@ from isp_images import MIPI, QUAD, images, linear, mosaic_of, psnr
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.isp import balance, chart, colour, denoise, fill, levels, tone
 from hesim_render.isp.frame_noise import FrameNoise
-from hesim_render.isp.steps import BlackLevel, ColourMatrix, Denoise, Development, WhiteBalance
+from hesim_render.isp.steps import BlackLevel, ColourMatrix, Denoise, Development, Fill, Tone, WhiteBalance
 from hesim_render.spectral import transfer
 from hesim_render.spectral.transfer import from_root, to_root
 
@@ -369,3 +369,26 @@ def test_eight_bits_are_those_of_the_nearest_of_65536_levels():
     levels = np.arange(1 << 16)
     found = transfer.encode((levels[:, None, None] / 65535).astype(np.float32) * np.ones(3, np.float32), depth=8)
     np.testing.assert_array_equal(found[:, 0, 1], np.rint(255 * transfer.encode_exactly(levels / 65535)))
+
+
+def test_steps_of_fill_and_tone_do_what_their_options_say():
+    raw = RNG.uniform(0, 1, (24, 32)).astype(np.float32)
+    camera = SimpleNamespace(filled_tile=np.array(QUAD))
+
+    def state(image, tile=MIPI):
+        return Development(image.copy(), camera, np.array(tile))
+
+    given = state(raw)
+    Fill(step="fill").run(given)
+    np.testing.assert_array_equal(given.image, raw)
+    Fill(step="fill", event_pixels=True).run(given)
+    np.testing.assert_array_equal(given.image, fill.fill_positions(raw, MIPI, QUAD))
+    np.testing.assert_array_equal(given.tile, QUAD)
+    assert not np.array_equal(given.image, raw)
+    Fill(step="fill", event_pixels=True).run(whole := state(raw, QUAD))
+    np.testing.assert_array_equal(whole.image, raw)
+    picture = RNG.uniform(0, 3, (40, 30, 3)).astype(np.float32)
+    Tone(step="tone", white=2.5).run(given := state(picture))
+    np.testing.assert_array_equal(given.image, tone.tone_global(picture, 2.5))
+    Tone(step="tone", method="local", compression=0.7, detail=1.5, radius_px=3).run(given := state(picture))
+    np.testing.assert_array_equal(given.image, tone.tone_local(picture, 0.7, 1.5, 3))

@@ -6,7 +6,7 @@ import pytest
 from hesim_render.core.backend import jit
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import partners
-from hesim_render.pixels.evs.balance import Balance, PixelSteps
+from hesim_render.pixels.evs.balance import CAUSE, EFFECT, Balance, LastSteps, PixelSteps
 from hesim_render.pixels.evs.events import EventLabels, Label, Lost
 from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise
@@ -438,3 +438,28 @@ def test_pairs_of_pixels_with_a_dead_time():
     cause, effect, lost = Balance(3).take(causes, effects)
     assert set(zip(cause.tolist(), effect.tolist(), strict=True)) == {(10, 0), (11, 5), (12, 1), (13, 2)}
     assert lost.size == 0
+
+
+def test_steps_wait_until_their_partners_come():
+    """Three causes of a pixel wait, of which the latest finds its partner first; a step back leaves the ones before."""
+    balance = Balance(3)
+    balance.take(steps((5, 0, 1, 10), (8, 0, 1, 11), (9, 0, 1, 12), (9, 2, -1, 13)), steps((7, 1, 1, 4)))
+    assert sorted(balance.waiting(CAUSE)) == [10, 11, 12, 13] and balance.waiting(EFFECT).tolist() == [4]
+    assert balance.is_idle(np.array([0, 1, 2]), 90).tolist() == [False] * 3
+    cause, effect, _ = balance.take(steps((21, 2, 1, 14)), steps((20, 0, 1, 5)))
+    assert (cause.tolist(), effect.tolist()) == ([12], [5])
+    assert sorted(balance.waiting(CAUSE)) == [10, 11] and balance.is_idle(np.array([2]), 90).all()
+    asleep = Balance(2, 10.0)
+    asleep.take(steps((3, 0, 1, 1)), steps((4, 0, 1, 2)))
+    assert asleep.is_idle(np.array([0, 0, 1]), 14).tolist() == [True, True, True]
+    assert asleep.is_idle(np.array([0, 1]), 13).tolist() == [False, True]
+
+
+def test_last_steps_wait_until_the_next_of_their_own_sequence():
+    last = LastSteps(3, 10.0)
+    cause, effect = last.take(steps((5, 0, 1, 10), (8, 0, 1, 11), (9, 2, -1, 13)), steps((7, 1, 1, 4), (9, 2, 1, 6)))
+    assert cause.size == effect.size == 0
+    assert sorted(last.waiting(CAUSE)) == [11, 13] and sorted(last.waiting(EFFECT)) == [4, 6]
+    cause, effect = last.take(steps((30, 1, 1, 15)), steps((31, 0, 1, 7), (32, 2, -1, 8)))
+    assert sorted(zip(cause.tolist(), effect.tolist(), strict=True)) == [(11, 7), (13, 8), (15, 4)]
+    assert last.is_idle(np.array([0, 1]), 40).tolist() == [False, True] and last.is_idle(np.array([0]), 41).all()

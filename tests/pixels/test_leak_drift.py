@@ -261,3 +261,13 @@ def test_the_mean_rate_is_that_of_its_law():
 def test_keys_that_do_not_go_together(changes, told):
     with pytest.raises(SpecError, match=told):
         read_sensor("reference-mono", {"evs.photoreceptor_cutoff_hz": 90.0, "evs.reference": "last_event", **changes})
+
+
+def test_the_mean_leak_of_a_pixel_grows_with_its_signal():
+    """And the tail adds the mean of a law with the share T/(T + r) above r, cut off at 1 kHz."""
+    plain = LeakSpec(process="drift", rate_hz=0.3, rate_hz_per_dn=0.02)
+    assert plain.mean_rate_hz(40.0) == pytest.approx(1.1)
+    tail = plain.model_copy(update={"tail_hz": 0.5})
+    rate = np.linspace(0, 1000, 2_000_001)
+    share = (0.5 / (0.5 + rate) - 0.5 / 1000.5) / (1 - 0.5 / 1000.5)
+    assert tail.mean_rate_hz(40.0) == pytest.approx(1.1 + np.trapezoid(share, rate), rel=1e-4)

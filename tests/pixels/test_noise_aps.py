@@ -1,5 +1,7 @@
 """The frame noise model against the formulas, written out again here."""
 
+from types import SimpleNamespace
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from scipy import stats
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.aps.fixed_pattern import FixedPattern
 from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
 from hesim_render.sensor.reading import read_sensor
 
@@ -559,3 +562,15 @@ def test_a_signal_that_does_not_rise_is_refused(curve):
     with pytest.raises(SpecError, match=r"slope of at least 0.05|at least 1 item"):
         model(aps__nonlinearity=curve)
     assert model(aps__nonlinearity=[0.0, -1.8, 1.4]).mean_dn(1.0, EXPOSURE_US) > 0
+
+
+@pytest.mark.parametrize("beta", [None, (1.0,)])
+def test_a_measured_dark_current_grows_with_the_temperature(beta):
+    """DN/s over DN/e⁻ times the growth; a count has no mean below 0, the variance of a polynomial may."""
+    measured = {"n_dp": np.array([[3.0, -0.4]], np.float32)}
+    spec = SimpleNamespace(system_gain_dn_per_e=0.25, dark_current_growth=1.7, beta=beta)
+    pattern = SimpleNamespace(spec=spec, off=(), _measured=measured)
+    expected = np.array([[20.4, -2.72 if beta else 0.0]])
+    np.testing.assert_allclose(FixedPattern.dark_e_per_s.func(pattern), expected, rtol=1e-6)
+    pattern.off = ("dark_current",)
+    assert FixedPattern.dark_e_per_s.func(pattern) == 0

@@ -135,6 +135,7 @@ def test_frames_have_boxes_and_masks_of_coco(recorded, tmp_path):
     for entry, frame in zip(content["images"], recorded.frames, strict=True):
         image = recorded.stored_truth.read("frames/object", frame.index)
         assert (entry["height"], entry["width"]) == image.shape == frame.raw.shape
+        assert entry["t_us"] == frame.exposure_start_us + 0.5 * frame.exposure_us
         assert (out / "images" / entry["file_name"]).is_file()
         here = [item for item in content["annotations"] if item["image_id"] == entry["id"]]
         assert [item["track_id"] for item in here] == sorted(set(np.unique(image)) - {0})
@@ -181,6 +182,8 @@ def test_each_event_has_the_object_that_its_pixel_shows_at_its_time(recorded, tm
         _ = again.event_objects
     (again.path / "truth" / "event_objects.h5").unlink()
     np.testing.assert_array_equal(hr.Recording.load(again.path).event_objects, found)  # from the scene
+    part = hr.Recording.load(again.path).labelled_slice(0, int(events["t_us"][9]))
+    np.testing.assert_array_equal(part["object"], found[: part.size])
 
 
 def test_a_slice_has_the_cause_and_the_object_of_each_event(recorded, tmp_path, monkeypatch):

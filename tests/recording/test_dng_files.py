@@ -9,9 +9,11 @@ import pytest
 import rawpy
 import recordings
 import tifffile
+from PIL import Image
 
 import hesim_render as hr
 from hesim_render.core.errors import HesimWarning, SpecError
+from hesim_render.recording import camera_raw
 from hesim_render.recording.dng import noise_profile, write_dng
 from hesim_render.recording.imports import import_recording
 from hesim_render.recording.outline import scene_name
@@ -153,3 +155,26 @@ def as_cameras_write(source, target):
         file.write(first, photometric="rgb", subfiletype=1, subifds=1, metadata=None,
                    extratags=[tags[code] for code in camera])  # fmt: skip
         file.write(raw, photometric=32803, subfiletype=0, metadata=None, extratags=[tags[code] for code in mosaic])
+
+
+def test_the_memory_of_a_png_is_asked_for_before_it_is_read(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(camera_raw, "require_memory", lambda size, *words: asked.append(size))
+    Image.fromarray(np.arange(15, dtype=np.uint16).reshape(3, 5)).save(tmp_path / "a.png")
+    frame = camera_raw._png(tmp_path / "a.png", (3, 5))
+    assert asked == [30] and frame[2].tolist() == [10, 11, 12, 13, 14]
+
+
+def test_directories_of_exposures_begin_at_even_places(tmp_path):
+    """Behind descriptions of any length; all files have the same directory, which ends with the file."""
+    recording, path, lengths = recordings.make("reference-bayer"), tmp_path / "a.dng", []
+    for number in range(6):
+        text = {"a": "x" * (2 * number)}
+        write_dng(path, recording.frames[0].raw, recording.mosaic, exposure_us=4000, description=text)
+        with tifffile.TiffFile(path) as file:
+            tag = file.pages[0].tags[34665]
+            assert tag.value["ExposureTime"] == (1, 250)
+            begin = tag.valueoffset
+        assert begin % 2 == 0
+        lengths.append(path.stat().st_size - begin)
+    assert len(set(lengths)) == 1

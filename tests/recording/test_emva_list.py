@@ -6,7 +6,7 @@ import tifffile
 from PIL import Image
 
 from hesim_render.core.errors import SpecError
-from hesim_render.recording.emva_list import find_list, read_list
+from hesim_render.recording.emva_list import _Pictures, find_list, read_list
 from hesim_render.recording.grey_picture import grey_size, read_grey
 
 SHAPE = 5, 7
@@ -143,3 +143,19 @@ def test_the_list_of_a_folder_is_a_text_file_with_a_line_of_sizes(tmp_path):
         find_list(tmp_path)
     (tmp_path / "EMVA1288_Data.txt").write_text("n 12 7 5\n")
     assert find_list(tmp_path) == tmp_path / "EMVA1288_Data.txt"
+
+
+def test_a_name_through_a_link_that_leads_out_is_refused_even_if_its_end_is_here(tmp_path):
+    """Of a path of another machine, the end is taken; a relative one stays in the folder."""
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "link").symlink_to(tmp_path / "outside")
+    (tmp_path / "set" / "a.png").touch()
+    pictures = _Pictures(tmp_path / "set" / "list.txt")
+    for name in ("C:\\lab\\A.png", "/lab/a.png", "a.png", "'lab/a.png'"):
+        assert pictures.find(3, name) == tmp_path / "set" / "a.png"
+    for name in ("link/a.png", "../set/a.png", ""):
+        with pytest.raises(SpecError, match="leads out of its folder"):
+            pictures.find(3, name)
+    with pytest.raises(SpecError, match=r"no such file: 'b\.png'"):
+        pictures.find(3, "b.png")

@@ -6,11 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import Image
+from ruamel.yaml import YAML
 
+import hesim_render as hr
+from hesim_render.exchange import open_events
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.report import simulated
 from hesim_render.report import simulated_frames as frames
 from hesim_render.report.simulated import REFERENCE_LUX, Instrument
+from hesim_render.sensor.from_data_sheet import electrons_per_s_lux
+from hesim_render.spectral.spectrum import illuminant
 
 
 class Stage:
@@ -309,3 +314,29 @@ def test_a_session_goes_from_coarse_to_fine_steps_to_other_lights(tick_us, monke
     np.testing.assert_allclose(fine - fine[:, 3:4], -(fine - fine[:, 3:4])[:, ::-1], atol=1e-12)
     assert pairs == pytest.approx([0.52, 0.68]) and told[-2] == pytest.approx(theta)
     assert told[0] < told[-3] < told[-1] < 1 and len(made._content["busy"]) == 2
+
+
+def test_an_instrument_knows_the_flux_of_each_pixel_and_writes_its_files(tmp_path):
+    sensor = hr.load_sensor("gen2").crop(8, 8)
+    made = Instrument(sensor, tmp_path, 5, lambda what, part: None)
+    names = {sensor.spec.pixels[sensor.spec.tile_rows[row][col]].filter for row, col in sensor.spec.positions("evs")}
+    flux = {name: electrons_per_s_lux(sensor.spec, name, illuminant("D65")) for name in names}
+    window_s = sensor.spec.evs.window_us * 1e-6
+    position = sensor.layout.evs_position.ravel()
+    for k, (row, col) in enumerate(sensor.spec.positions("evs")):
+        own = flux[sensor.spec.pixels[sensor.spec.tile_rows[row][col]].filter] * window_s
+        np.testing.assert_allclose(made._per_lux[position == k], own)
+    np.testing.assert_allclose(np.array(made._electrons(3.0)), 3 * made._per_lux, rtol=1e-6)
+    assert made._notes().startswith("simulated; even light, D65; ")
+    made._stage()
+    made._stage()
+    assert made._seed == 7
+    events = np.zeros(2, no_events().dtype)
+    events["t_us"], events["x"], events["y"], events["polarity"] = [3, 9], [1, 0], [0, 1], [1, -1]
+    made._save(events, "a")
+    stream = np.concatenate(list(open_events(tmp_path / "a.raw")))
+    assert stream["t_us"].tolist() == [3, 9] and stream["x"].tolist() == [1, 0]
+    made._write()
+    content = YAML().load((tmp_path / "bench.yaml").read_text())
+    assert (content["rows"], content["cols"]) == sensor.layout.evs_shape
+    assert content["simulated"] and "steady" not in content and content["schema_version"] == 1

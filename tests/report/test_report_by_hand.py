@@ -9,11 +9,12 @@ from matplotlib.figure import Figure
 from scipy import special
 from scipy.stats import norm
 
-from hesim_render.core.errors import SpecError
-from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, s_curves
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, run, s_curves, simulate
 from hesim_render.report.bench import EventBench
 from hesim_render.report.estimates import crossing, log_estimated, mean_error, quantile, whole_us_quantile
 from hesim_render.report.latency import Answers
+from hesim_render.report.s_curves import SCurve
 from hesim_render.report.steady import Background, _rate, doubling
 
 Z = 1.959963984540054
@@ -385,3 +386,202 @@ def test_what_an_s_curve_lacks_is_said():
     steep = s_curves._problem(size, np.array([0.01, 0.02, 0.96, 0.98]), 20)
     assert steep and "0.2" in steep and "0.3" in steep
     assert s_curves._problem(size, np.array([0.01, 0.04, 0.96, 0.98]), 20) == ""
+
+
+def test_chance_is_the_share_of_windows_of_still_light_with_an_event():
+    """Windows of 100 µs from the begin on, a last part of one left out; pixels that are not good do not count."""
+    times, x, y, on = np.array([
+        (50, 0, 0, 1), (110, 1, 0, 1), (115, 1, 0, 1), (160, 1, 0, 0), (249, 2, 1, 1), (250, 0, 1, 1), (349, 0, 1, 1),
+        (350, 2, 0, 1), (370, 2, 0, 1),
+    ]).T  # fmt: skip
+    events = np.zeros(times.size, [("t_us", "i8"), ("x", "u2"), ("y", "u2"), ("polarity", "i1")])
+    events["t_us"], events["x"], events["y"], events["polarity"] = times, x, y, 2 * on - 1
+
+    class Stream(list):
+        def span_us(self):
+            return 50, 390
+
+    bench = SimpleNamespace(stream=lambda file: Stream([events[:4], events[4:]]), pixels=6, shape=(2, 3))
+    good = np.array([1, 1, 1, 1, 0, 1], bool)
+    steady = SimpleNamespace(file="a")
+    # three windows of five pixels: (0, 0) and (0, 1) in the first, (1, 2) in the second, (1, 0) in the third
+    assert limits.false_share(bench, steady, 100, 0, good) == pytest.approx(4 / 15)
+    assert limits.false_share(bench, steady, 100, 1, good) == pytest.approx(1 / 15)
+    good[0] = False
+    assert limits.false_share(bench, steady, 100, 0, good) == pytest.approx(3 / 12)
+    assert np.isnan(limits.false_share(bench, steady, 341, 0, good))
+
+
+def test_an_s_curve_goes_from_chance_to_one():
+    curve = SCurve(9.0, None, None, None, 0.1, {}, 0.3, 0.05, 40)
+    np.testing.assert_allclose(curve.at(np.array([-9.0, 0.3, 0.35, 9.0])), [0.1, 0.55, 0.1 + 0.9 * norm.cdf(1), 1])
+
+
+@pytest.mark.parametrize(("events", "frames"), [(True, True), (True, False), (False, True), (False, False)])
+def test_captures_are_simulated_of_the_kinds_of_pixels_that_a_sensor_has(events, frames, monkeypatch, tmp_path):
+    """Nine tenths of the progress are those of events, where there are both."""
+    shown = []
+
+    def instrument(kind):
+        def made(sensor, folder, seed, progress):
+            progress(kind, 0.5)
+            assert folder == tmp_path / kind and seed == 7 and (folder.is_dir() or kind == "frames")
+            return SimpleNamespace(record=lambda: (kind, sensor))
+
+        return made
+
+    spec = SimpleNamespace(
+        evs=events or None, aps=frames or None, evs_grid=SimpleNamespace(rows_per_tile=1, cols_per_tile=2)
+    )
+    layout = SimpleNamespace(tile_shape=(2, 6), shape=(31, 47))
+    sensor = SimpleNamespace(spec=spec, name="mine", layout=layout, crop=lambda cols, rows: (cols, rows))
+    monkeypatch.setattr(simulate, "load_sensor", lambda name: sensor)
+    monkeypatch.setattr(simulate, "Instrument", instrument("events"))
+    monkeypatch.setattr(simulate, "FrameInstrument", instrument("frames"))
+    paths = tmp_path / "events", tmp_path / "frames"
+    given = ("s", *paths, (7, 9), 7, lambda what, part: shown.append((what, part)))
+    if not (events or frames):
+        with pytest.raises(RangeError, match="a sensor with frame or event pixels"):
+            simulate.simulate_captures(*given)
+        return
+    made = simulate.simulate_captures(*given)
+    # 7 rows of pixels of one a tile of 2 rows, 9 columns of two a tile of 6; frame pixels in whole tiles
+    assert made == (("events", (30, 14)) if events else None, ("frames", (42, 14)) if frames else None, "mine")
+    parts = {"events": 0.45 if frames else 0.5, "frames": 0.95 if events else 0.5}
+    kinds = [kind for kind, there in (("events", events), ("frames", frames)) if there]
+    assert shown == [(kind, pytest.approx(parts[kind])) for kind in kinds]
+    # a sensor smaller than that is taken whole, without the rest of a tile
+    assert simulate._region(sensor, (90, 90), (1, 2)) == (42, 30)
+
+
+def test_answers_are_the_first_events_of_the_right_polarity_within_the_window():
+    """Jumps up at 100, down at 180 and up at 300 µs: the window is the shortest time between two, or as stated."""
+    events = np.array(
+        [(99, 1, 1, 1), (100, 0, 1, 1), (130, 1, 0, 1), (140, 1, 0, 1), (150, 1, 1, -1), (178, 2, 1, 1), (180, 0, 0, 1),
+         (181, 0, 0, -1), (261, 2, 0, -1), (345, 2, 1, 1), (360, 2, 1, 1), (380, 0, 1, 1), (381, 1, 1, 1)],
+        [("t_us", "i8"), ("x", "u2"), ("y", "u2"), ("polarity", "i1")],
+    )  # fmt: skip
+    jumps = np.array([100, 180, 300]), np.array([True, False, True])
+    bench = SimpleNamespace(
+        stream=lambda file: [events[:4], events[4:10], events[10:]], _jumps=lambda steps, stream: jumps, pixels=6,
+        shape=(2, 3), path=str,
+    )  # fmt: skip
+    found = EventBench.answers_to(bench, SimpleNamespace(file="a", window_us=None))
+    assert found.window_us == 80
+    first, second, third = np.zeros((3, 6), int)
+    first[[0, 1, 5]] = 80, 30, 78  # the jump at 180 µs begins after the event at that time
+    second[0] = 1
+    third[[5, 3]] = 45, 80
+    np.testing.assert_array_equal(found.latency_us, [first, second, third])
+    short = EventBench.answers_to(bench, SimpleNamespace(file="a", window_us=50))
+    assert short.window_us == 50
+    np.testing.assert_array_equal(short.latency_us, [np.where(row <= 50, row, 0) for row in (first, second, third)])
+
+
+def modulation(bursts=None, hz=2000.0, file="a"):
+    return SimpleNamespace(file=file, hz=hz, bursts=bursts, depth=0.5, lux=9.0)
+
+
+def bench_of(rows, span_us, group):
+    """A bench of 2 by 3 pixels with events (t_us, x, y, polarity), in two blocks."""
+    events = np.array(rows, [("t_us", "i8"), ("x", "u2"), ("y", "u2"), ("polarity", "i1")])
+
+    class Stream(list):
+        def span_us(self):
+            return span_us
+
+    half = len(events) // 2
+    return SimpleNamespace(
+        stream=lambda file: Stream([events[:half], events[half:]]), pixels=6, shape=(2, 3), path=str,
+        tally=lambda file: SimpleNamespace(group=np.array(group)),
+    )  # fmt: skip
+
+
+def test_cycles_with_an_answer_are_counted_after_two_warm_ones():
+    """500 µs a cycle from 40 µs on: three whole ones begin at 1040 µs. A polarity or a burst's length decides."""
+    rows = [(1039, 0, 0, 1), (1040, 0, 0, 1), (1100, 0, 0, 1), (1539, 1, 0, 1), (1540, 2, 0, 1), (1600, 0, 1, -1),
+            (2000, 2, 0, -1), (2539, 2, 1, 1), (2541, 0, 0, 1), (2541, 1, 1, -1)]  # fmt: skip
+    bench, good = bench_of(rows, (40, 2560), [0, 0, 1, 1, 2, 5]), np.array([1, 1, 1, 0, 1, 1], bool)
+    assert modulated._cycles(bench, modulation()) == (1040.0, 500.0, 3)
+    share = np.array([1, 1, 1, 0, 0, 1]) / 3
+    expected = np.full(modulated.GROUPS + 1, share[good].mean())
+    for group, left in ((0, [2, 4, 5]), (1, [0, 1, 4, 5]), (2, [0, 1, 2, 5]), (5, [0, 1, 2, 4])):
+        expected[1 + group] = share[left].mean()
+    np.testing.assert_allclose(modulated._answered(bench, modulation(), good), expected)
+    counts = np.array([[2, 1, 1, 0, 0, 1], [0, 0, 1, 1, 0, 0]]) / 3
+    np.testing.assert_allclose(modulated._counts(bench, modulation(), good)[:, 0], counts[:, good].mean(axis=1))
+    bursts = SimpleNamespace(period_us=700, begin_us=1040, length_us=60)
+    assert modulated._cycles(bench, modulation(bursts)) == (1040.0, 700.0, 2)
+    # within 60 µs of 1040 and 1740 µs, of either polarity
+    assert modulated._answered(bench, modulation(bursts), good)[0] == pytest.approx(np.mean([0.5, 0, 0, 0, 0]))
+    short = bench_of(rows, (40, 1539), [0] * 6)
+    assert np.isnan(modulated._answered(short, modulation(), good)).all()
+    assert not modulated._counts(short, modulation(), good).any()
+
+
+def test_the_swing_that_half_answer_lies_between_those_around_it():
+    parts = [(0.8, np.array([0.9, 0.2])), (0.2, np.array([0.1, 0.1])), (0.4, np.array([0.4, 0.15]))]
+    expected = crossing(np.log([0.2, 0.4, 0.8]), np.array([0.1, 0.4, 0.9]), np.zeros(3), 0.5, 1e4)
+    assert modulated._half(parts, 0) == pytest.approx(np.exp(expected[0])) and 0.4 < np.exp(expected[0]) < 0.5
+    assert np.isnan(modulated._half(parts, 1))
+    assert np.isnan(modulated._half([*parts, (1.0, np.array([np.nan, 1.0]))], 0))
+
+
+@pytest.mark.parametrize(
+    ("shares", "reason"),
+    [
+        ({100: 0.2, 300: 0.2, 900: 0.2}, "answered at fewer than two frequencies"),
+        ({100: 0.8, 300: 0.8, 900: 0.2}, "above 300 Hz"),
+        ({100: 0.8, 300: 0.8, 900: 0.8}, "above 900 Hz"),
+    ],
+)
+def test_what_bandwidth_lacks_is_said(shares, reason, monkeypatch):
+    monkeypatch.setattr(modulated, "_answered", lambda bench, one, good: np.full(21, shares[int(one.hz)] * one.depth))
+    each = [(float(hz), depth) for hz in shares for depth in (0.3, 0.9)]
+    every = [SimpleNamespace(**{**vars(modulation(hz=hz)), "depth": depth}) for hz, depth in each]
+    bench = SimpleNamespace(spec=SimpleNamespace(modulation=every))
+    found = modulated.bandwidth(bench, np.array([True, True, False]))
+    assert reason in found.entry["reason"] and found.pixels == 2 and found.hz.tolist() == [100, 300, 900]
+    bench.spec.modulation = []
+    assert modulated.bandwidth(bench, np.ones(3, bool)) is None
+
+
+@pytest.mark.parametrize(("step", "start", "ticks"), [(1, 0, False), (2, 5, True), (3, 0, True), (50, 7, True)])
+def test_pixels_with_ticks_have_times_that_are_multiples_of_one(step, start, ticks):
+    times = start + step * np.array([0, 4, 10, 15, 22])
+    events = np.zeros(5, [("t_us", "i8")])
+    events["t_us"] = times
+    spec = SimpleNamespace(steps=[SimpleNamespace(file="a")] * 4)
+    bench = SimpleNamespace(spec=spec, stream=lambda file: [events[:3], events[2:], events[:0]])
+    assert figures._has_ticks(bench) == ticks
+    bench.stream = lambda file: [events[:1]]
+    assert not figures._has_ticks(bench)  # nothing tells
+
+
+@pytest.mark.parametrize("kinds", [("events",), ("frames",), ("events", "frames")])
+def test_a_report_has_each_table_once_and_a_page_for_each_kind_of_pixels(kinds, monkeypatch, tmp_path):
+    told = []
+
+    class Pages:
+        count = 3
+
+        def __init__(self, file, title):
+            told.append(title)
+
+        def __getattr__(self, name):
+            return lambda *given: told.append((name, *given[:1]))
+
+    for name in ("events", "frames"):
+        kind = name.removesuffix("s")
+        monkeypatch.setattr(run, f"{kind}_tables", lambda _, name=name: [f"{name} {k}" for k in range(3)])
+        monkeypatch.setattr(run, f"{kind}_drawings", lambda _: [])
+    for name in ("_about", "_json", "filled"):
+        monkeypatch.setattr(run, name, lambda *given, **more: "about")
+    monkeypatch.setattr(run, "Document", Pages)
+    given = [SimpleNamespace(findings=[name]) if name in kinds else None for name in ("events", "frames")]
+    assert run._write(tmp_path, "mine", *given) == 3
+    assert [one[1] for one in told[1:] if one[0] == "table"] == [f"{name} {k}" for name in kinds for k in range(3)]
+    texts = ["Test report: mine", "about", *(f"Note: {name}" for name in kinds)]
+    assert [one[1] for one in told[1:] if one[0] == "text"] == texts
+    # frames alone have a page of figures, and both kinds begin pages of their own
+    assert told.count(("new_page",)) == (0 if kinds == ("events",) else 1) and told[-1] == ("close",)

@@ -410,3 +410,33 @@ def test_edges_of_the_motion_are_passed_on_and_times_are_those_of_both():
     assert np.isin(plain.sample_times_us(0, 5000), times).all()
     assert {300.0, 301.0, 1000.0, 1001.0} <= set(times)
     assert np.all(np.diff(times) > 0) and times[0] > 0 and times[-1] < 5000
+
+
+def test_means_over_parts_of_a_microsecond_weight_the_pieces_by_their_lengths():
+    """A jump of the light within intervals of 0.6 and 0.9 µs, and a piece that only one of the pixels reaches."""
+    light = Pwm(400, 0.3)  # on for 750 µs
+    flux = FlickerFlux([light], [Formula(slope_per_s=300.0)])
+    begin, end = np.array([749.8, 749.3, 740.0]), np.array([750.4, 750.2, 741.0])
+    half_a, half_b = flux.mean_flux(np.arange(3, dtype=np.uint32), begin, end)
+    lit = np.minimum(end, 750.0)
+    middle = (begin + lit) / 2
+    expected = 1e5 * (1 + 300e-6 * middle) * (lit - begin) / (end - begin) / 0.3
+    np.testing.assert_allclose((np.array(half_a) + np.array(half_b)) / 2, expected, rtol=1e-5)
+    nothing = flux.mean_flux(np.arange(0, dtype=np.uint32), 1.0, 2.0)
+    assert np.array(nothing[0]).size == 0
+
+
+def test_windows_that_straddle_slices_have_the_mean_of_their_parts():
+    class Sliced(Formula):
+        def slice_edges_us(self, begin_us, end_us):
+            return np.array([at for at in (100.0, 160.0) if begin_us < at < end_us])
+
+        def mean_flux(self, pixel, begin_us, end_us):
+            level = {0: 5.0, 1: 7.0, 2: 11.0}[int(np.searchsorted([100.0, 160.0], begin_us, side="right"))]
+            return level, 2 * level
+
+    begin, end = np.array([0.0, 70.0, 150.0, 120.0]), np.array([50.0, 180.0, 170.0, 120.0])
+    block = Block(begin, end, np.array([False, True, True, True]))
+    found = [(one.half_a, one.half_b) for one in Sliced().flux_of_blocks(np.arange(2), [block])]
+    means = [(30 * 5 + 60 * 7 + 20 * 11) / 110, 9.0, 7.0]
+    np.testing.assert_allclose(found, [(mean, 2 * mean) for mean in means])

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from hesim_render.core.backend import jit
 from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.truth.imu import _velocity
 from hesim_render.specs.motion import TrackSpec
 
 
@@ -112,3 +113,25 @@ def test_a_track_without_motion_does_not_move():
     still = {"translation_m": (1, 0, 0), "rotation_deg": 90}
     assert not track({"t_us": 0, **still}, {"t_us": 10, **still}).moves
     assert track({"t_us": 0, **still}, {"t_us": 10, "translation_m": (1, 0, 0), "rotation_deg": 450}).moves
+
+
+@pytest.mark.parametrize("repeat", [False, True])
+def test_the_velocity_of_a_point_is_the_slope_of_its_path(repeat):
+    """Central differences over 2 µs; 0 before the first keyframe and from the last one on, where the pose is held."""
+    keys = [{"t_us": 4000, "translation_m": [0.1, 0, 0]},
+            {"t_us": 7000, "translation_m": [0.3, 0.2, 0], "rotation_axis": [0, 1, 0], "rotation_deg": 50},
+            {"t_us": 12000, "translation_m": [0, -0.1, 0.4], "rotation_axis": [1, 0, 0], "rotation_deg": -20},
+    ]  # fmt: skip
+    moves = Trajectory(TrackSpec.model_validate(
+        {"object": "camera", "pivot_m": [0.2, -0.1, 0.3], "keyframes": keys, "repeat": repeat}
+    ))  # fmt: skip
+    place = np.array([0.5, 0.7, -0.2])
+    times = np.array([10.0, 3998.0, 4002.0, 6500.0, 7100.0, 11_990.0, 12_002.0, 12_500.0, 15_900.0])
+    points = [(moves.matrix(times + step) @ np.append(place, 1.0))[:, :3] for step in (-1, 1)]
+    slope = (points[1] - points[0]) / 2e-6
+    np.testing.assert_allclose(_velocity(moves, place, times), slope, rtol=1e-5, atol=1e-4)
+    assert np.all(slope.any(axis=1) == (repeat | ((times > 4000) & (times < 12_000))))
+    edges = _velocity(moves, place, np.array([4000.0, 7000.0, 12_000.0]))  # just after each
+    np.testing.assert_allclose(edges[:2], _velocity(moves, place, np.array([4000.5, 7000.5])), rtol=2e-3, atol=1e-2)
+    assert edges[2].any() == repeat
+    assert _velocity(None, place, times).shape == (9, 3) and not _velocity(None, place, times).any()

@@ -14,7 +14,15 @@ from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.reading import read_sensor
 from hesim_render.specs import SceneSpec, SensorSpec, files, read_scene
 from hesim_render.specs.event_pixels import EvsSpec
-from hesim_render.specs.files import Strict, content_hash, data_folder, list_names, parse_override
+from hesim_render.specs.files import (
+    Strict,
+    apply_overrides,
+    content_hash,
+    data_folder,
+    list_names,
+    load_yaml,
+    parse_override,
+)
 from hesim_render.specs.frame_pixels import ApsSpec
 
 SENSOR = (data_folder("sensors") / "eiger.yaml").read_text()
@@ -456,3 +464,13 @@ def test_limits_and_defaults_of_numbers_are_round():
                 digits = f"{abs(field.default):.15g}".replace(".", "").partition("e")[0].strip("0")
                 assert len(digits) <= 2, f"{where}: {field.default}"
     assert count > 350
+
+
+def test_items_of_lists_are_set_by_their_numbers(tmp_path):
+    (tmp_path / "a.yaml").write_text("a:\n- {b: 1, c: [3, 4, 5]}\n- 7\nd: 2\n")
+    data = load_yaml(tmp_path / "a.yaml")
+    apply_overrides(data, {"a.0.c.1": 8, "a.1": {"e": 9}, "d": [1], "f.g": 6})
+    assert data == {"a": [{"b": 1, "c": [3, 8, 5]}, {"e": 9}], "d": [1], "f": {"g": 6}}
+    for key, most in (("a.2", 1), ("a.0.c.x", 2), ("a.0.c.3", 2)):
+        with pytest.raises(SpecError, match=f"the list here has items 0 to {most}"):
+            apply_overrides(data, {key: 1})

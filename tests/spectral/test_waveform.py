@@ -127,3 +127,17 @@ def test_following_times_keep_the_logarithm_straight(name):
 def test_wrong_waveforms_are_refused(given, text):
     with pytest.raises(ValueError, match=text):
         LightSpec.model_validate({"type": "uniform", "illuminance_lux": 1, "waveform": given})
+
+
+def test_what_is_constant_has_no_times_and_the_highest_power_is_that_of_the_peak():
+    for constant in (Mains(50, 0), Pwm(300, 1.0), TableWaveform((0, 5, 9), (2, 2, 2))):
+        assert constant.follow_us(0, 20_000).size == constant.jumps_us(0, 20_000).size == 0
+        assert constant.highest == 1
+    assert Mains(50, 0.3).highest == pytest.approx(1.3) and Pwm(300, 0.4).highest == pytest.approx(2.5)
+    # a mean of (1·10 + 2·30)/40 over the table
+    assert TableWaveform((5, 15, 45), (1, 1, 3)).highest == pytest.approx(3 / (70 / 40))
+
+
+def test_jumps_of_a_pulsed_light_are_at_both_ends_of_its_pulses():
+    """4 kHz, on for a tenth of 250 µs, 90° ahead: switched on at −62.5 µs and every 250 µs from there."""
+    np.testing.assert_allclose(Pwm(4000, 0.1, 90.0).jumps_us(100, 700), [187.5, 212.5, 437.5, 462.5, 687.5])

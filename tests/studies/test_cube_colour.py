@@ -114,3 +114,14 @@ def test_a_scene_is_rendered_into_a_cube(tmp_path):
     assert rows["surfaces"].tolist() == ["colorchecker", "rendered"]
     for key in ("delta_e_cube_mean", "delta_e_cube_p95", "delta_e_cube_max"):
         assert rows[key][0] == pytest.approx(rows[key][1], rel=1e-9) and rows[key][0] > 0.1
+
+
+def test_a_cube_in_percent_has_the_figures_of_its_reflectances(tmp_path):
+    cube = smooth_cube(5, 4)
+    np.save(tmp_path / "cube.npy", cube)
+    np.save(tmp_path / "percent.npy", 100 * cube)
+    item = {"cube": str(tmp_path / "cube.npy"), "wavelength_nm": BANDS.tolist()}
+    percent = {**item, "cube": str(tmp_path / "percent.npy"), "scale": 0.01}
+    one, other = (hr.study({**STUDY, "surfaces": [each], "illuminants": ["A"]}).row(0) for each in (item, percent))
+    for key in ("delta_e_cube_mean", "delta_e_cube_p95", "delta_e_cube_max"):
+        assert other[key] == pytest.approx(one[key], rel=1e-4) and one[key] > 0.1

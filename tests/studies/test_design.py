@@ -26,7 +26,7 @@ from hesim_render.studies.design import BANDS_NM as DESIGN_NM
 from hesim_render.studies.design import Problem, optimise, silicon_depth
 from hesim_render.studies.design_cost import Condition, DesignCost, Weights, best_matrix, difference_weights
 from hesim_render.studies.design_filters import Dyes, FreeCurves, ThinFilms
-from hesim_render.studies.design_run import CHART_PX, _judgement, _verdicts, design
+from hesim_render.studies.design_run import CHART_PX, _judgement, _verdicts, design, designed_set
 from hesim_render.studies.design_tile import counts_of, spread_tile
 from hesim_render.studies.verdict import design_verdict
 
@@ -481,3 +481,10 @@ def test_shipped_designs_load():
     assert len(designs) == 3
     for name in designs:
         assert Problem(read_design(name)).starts()
+
+
+@pytest.mark.parametrize(("tile_px", "shares"), [(None, {"red": 0.5}), ([4, 4], None), (None, None)])
+def test_a_set_whose_shares_are_not_varied_or_drawn_is_kept(tile_px, shares):
+    own = object()
+    problem = SimpleNamespace(filter_set=own, spec=SimpleNamespace(tile_px=tile_px))
+    assert designed_set(problem, SimpleNamespace(shares=shares)) is own

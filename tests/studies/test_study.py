@@ -20,6 +20,7 @@ from hesim_render.specs.run import StudyKind, study_kind
 from hesim_render.specs.study import read_study
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.studies import Table, channel_noise, with_filter_set
+from hesim_render.studies import report as study_report
 from hesim_render.studies.filter_sets import filters_of, mixing
 from hesim_render.studies.plots import pareto_front
 from hesim_render.studies.run import study
@@ -475,3 +476,7 @@ def test_levels_and_candidates_of_a_verdict():
     (text,) = ranking(Table(twice))
     assert "YSNR ryyb crosstalk 0 41 ~ ryyb crosstalk 0.08 41 > rccb crosstalk 0 32.5 ~ " in text
     assert ranking(Table(rows[:1])) == ranking(Table([{"sensor": "s"}, {"sensor": "t"}])) == []
+
+
+def test_exposures_of_tables_are_in_ms():
+    assert study_report._in_ms(2500) == 2.5 and study_report._in_ms(1250.0) == 1.25 and study_report._in_ms("a") == "a"

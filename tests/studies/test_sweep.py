@@ -2,6 +2,7 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from hesim_render.specs.files import data_folder
 from hesim_render.specs.run import StudyKind, study_kind
 from hesim_render.specs.sweep import RangeSpec, read_sweep
 from hesim_render.studies import sweep as sweeps
+from hesim_render.studies import sweep_metrics
 from hesim_render.studies.sweep import sweep
 from hesim_render.studies.sweep_metrics import RunFigures
 
@@ -248,3 +250,33 @@ def test_other_folders_and_damaged_runs_are_refused(tmp_path):
     run.write_text("{")
     with pytest.raises(OutputError, match="is damaged"):
         sweep(small, out=tmp_path / "out")
+
+
+def test_a_dry_run_says_how_many_runs_are_missing(tmp_path, capsys):
+    changes = {"vary": {}, "seeds": [5], "roi": "8x8", "metrics": ["electrons"], "duration_s": 0.02}
+    sweep({**BASE, **changes}, out=tmp_path / "out")
+    (tmp_path / "sweep.yaml").write_text(json.dumps({**BASE, **changes, "seeds": [4, 5, 6]}))
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["study", str(tmp_path / "sweep.yaml"), "--out", str(tmp_path / "out"), "--dry-run"])
+    assert stop.value.code == 0 and "3 runs, 2 of them not yet made" in capsys.readouterr().out
+
+
+def test_figures_of_a_run_by_hand(monkeypatch):
+    """Share of ON events, an MTF between two of its frequencies, and an edge that the full scale cuts off."""
+    polarity = np.array([(1,), (1,), (-1,), (1,)], [("polarity", "i1")])
+    given = SimpleNamespace(events=4, recording=SimpleNamespace(events=polarity))
+    assert RunFigures.on_share.fget(given) == 0.75
+    assert RunFigures.on_share.fget(SimpleNamespace(events=0)) is None
+    edge = SimpleNamespace(frequency_cy_per_px=np.array([0.2, 0.4, 0.6]), mtf=np.array([0.9, 0.5, 0.3]))
+    assert RunFigures.mtf_nyquist.fget(SimpleNamespace(edge=edge)) == pytest.approx(0.4)
+    assert RunFigures.mtf_nyquist.fget(SimpleNamespace(edge=None)) is None
+    mosaic = SimpleNamespace(black_level_dn=60, system_gain_dn_per_e=0.5, white_level_dn=1000)
+    frame = SimpleNamespace(electrons_mean=np.array([3.0, 1879.0]))
+    run = SimpleNamespace(
+        picture=1, recording=SimpleNamespace(mosaic=mosaic, frames=[frame]), pipeline=SimpleNamespace(without=str),
+        _of_clean=lambda pipeline: np.ones((2, 2, 3)),
+    )  # fmt: skip
+    monkeypatch.setattr(sweep_metrics, "edge_response", lambda y: SimpleNamespace(frequency_at=lambda share: share / 4))
+    assert RunFigures.picture_mtf50.fget(run) == 0.125
+    frame.electrons_mean[1] = 1880.0  # 60 + 940 DN
+    assert RunFigures.picture_mtf50.fget(run) is None

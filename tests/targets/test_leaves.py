@@ -101,3 +101,9 @@ def test_a_target_of_dead_leaves_is_drawn_to_its_size_and_seed():
     assert values.min() >= 0.05 and values.max() <= 0.8 and values.min() < 0.1 and values.max() > 0.75
     np.testing.assert_array_equal(values[..., 0], leaves_picture(56, 100, 2, 10, (0.05, 0.8), 5))
     assert np.any(values[..., 0] != leaves_picture(56, 100, 2, 10, (0.05, 0.8), 6))
+
+
+def test_leaves_without_sizes_span_a_400th_to_a_tenth_of_20_cm():
+    spec = TypeAdapter(TargetSpec).validate_python({"type": "dead-leaves"})
+    sizes = [spec.width_m, spec.width_m / spec.radius_min_m, spec.width_m / spec.radius_max_m, spec.texels_across]
+    assert sizes == pytest.approx([0.2, 400, 10, 2048])

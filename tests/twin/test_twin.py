@@ -451,3 +451,17 @@ def test_the_page_counts_the_statistics_that_pass():
     assert ", at exposure 5 s; rms" in page.check_line(checks[0])
     checks[0].place = "photons per pixel"
     assert ", at 5 photons per pixel; rms" in page.check_line(checks[0])
+
+
+def test_bins_of_deviations_reach_seven_medians_evenly_and_the_largest_in_equal_ratios():
+    image = np.concatenate([np.linspace(0, 12, 4001), np.geomspace(14, 3000, 4000)])
+    middle = float(np.median(image))
+    edges = bin_edges(image[:5000], image[5000:])
+    even, ratios = edges[edges < 7.0001 * middle], edges[edges > 6.9999 * middle][:-1]
+    np.testing.assert_allclose(np.diff(even), 7 * middle / 18)
+    np.testing.assert_allclose(ratios[1:] / ratios[:-1], (3000 / (7 * middle)) ** (1 / 8))
+    assert even.size == 19 and ratios.size == 8 and np.isinf(edges[-1])
+    # thin bins are joined with the next: 16 pixels of each image on average
+    thin = np.concatenate([np.full(500, 0.5), np.full(31, 1.5), np.full(40, 3.2), [3.5]])
+    edges = bin_edges(thin)
+    assert (counts_in(thin, edges) >= 32).all() and edges.size == 3

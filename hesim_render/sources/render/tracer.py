@@ -193,7 +193,7 @@ class PixelTracer(Tracer):
         begin, end = np.asarray(begin_us, dtype=np.float64), np.asarray(end_us, dtype=np.float64)
         full, key = (self._full_index, self._key) if elsewhere is None else (elsewhere, self._elsewhere_key)
         if pixel.size and int(pixel.max()) >= full.size:
-            raise RangeError("pixel", int(pixel.max()), f"0 to {self.pixel_count - 1}, inside the region")
+            raise RangeError("pixel", int(pixel.max()), f"0 to {full.size - 1}, inside the region")
         if not np.all(end >= begin):
             raise RangeError("end_us - begin_us", float(np.min(end - begin)), "0 or more")
         times = None

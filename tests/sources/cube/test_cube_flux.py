@@ -190,3 +190,21 @@ def test_a_cube_that_ends_early_holds_only_where_that_is_wanted(tmp_path):
     np.testing.assert_allclose(image(flux_of(path, sensor, beyond="hold", **given)), expected, rtol=1e-5)
     with pytest.raises(SpecError, match="or let its ends hold"):
         flux_of(path, sensor, **given)
+
+
+def test_instants_follow_a_cube_that_turns_zooms_and_moves(tmp_path):
+    """px/s at the corner: √(40² + 30²) + 15 · (ln 1.5 + 0.7) of 24 × 18 pixels, and half a pixel between instants."""
+    sensor = hr.load_sensor("reference-mono").crop(24, 18)
+    moves = {"pan_px_per_s": [40.0, -30.0], "zoom_per_s": 1 / 1.5, "rotation_deg_per_s": -float(np.degrees(0.7))}
+    flux = flux_of(saved(tmp_path, texture(18, 24)), sensor, **moves)
+    speed = 50 + 15 * (np.log(1.5) + 0.7)
+    count = int(np.ceil(0.08 * speed / 0.5))
+    times = flux.sample_times_us(20_000, 100_000)
+    np.testing.assert_allclose(times, 20_000 + 80_000 * np.arange(1, count) / count)
+    still = flux_of(tmp_path / "cube.npy", sensor)
+    assert still.sample_times_us(0, 1e6).size == 0 and flux.sample_times_us(0, 100).size == 0
+    # pixels in another order, with means of their own intervals
+    pixels, begin = np.array([400, 7], np.uint32), np.array([3000.0, 9000.0])
+    both = np.array(flux.mean_flux(pixels, begin, begin + 2000.0)[0])
+    alone = [np.array(flux.mean_flux(pixels[k : k + 1], begin[k], begin[k] + 2000)[0]).item() for k in range(2)]
+    np.testing.assert_allclose(both, alone, rtol=1e-5)

@@ -14,6 +14,7 @@ from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven import retrace
 from hesim_render.sources.render.change_driven.aim import Aims, PairAims, ball_around, in_blocks
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.small_objects import Zoom
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.primary_rays import RayFactory
@@ -249,3 +250,17 @@ def test_the_ball_around_an_object_touches_its_corners(kind):
     found = ball_around(SimpleNamespace(corners=corners, part=SimpleNamespace(form=forms[kind])))
     radius = 1.7 / 2 if kind == "one ball" else np.sqrt(0.4**2 + 1.2**2 + 1.7**2) / 2
     assert found == pytest.approx((0.3, 0.2, -0.15, radius))
+
+
+def test_windows_of_looks_are_rounded_outwards_to_eighths_of_their_length():
+    """Rows of a rolling shutter then share looks; a window shorter than 8 µs is rounded to whole µs."""
+    asked = []
+
+    def outlines(begin_us, end_us):
+        asked.append((begin_us, end_us))
+        return []
+
+    windows = Windows(np.array([1010.0, 1090.0, 1110.0, 7.4]), np.array([1810.0, 1890.0, 1910.0, 9.5]))
+    zoom = SimpleNamespace(_outlines=outlines)
+    Zoom._sites_of(zoom, np.arange(4), np.zeros(4, np.int64), windows, np.arange(4))
+    assert sorted(asked) == [(7.0, 10.0), (1000.0, 1900.0), (1100.0, 2000.0)]

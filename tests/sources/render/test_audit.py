@@ -560,3 +560,23 @@ def test_no_quality_is_named_where_values_have_the_most_rays(p99, short, quality
     audit = Audit(None, None, QUALITY, None, np.arange(3), 1)
     verdict = audit._verdict([part | {"deviation_noise": {"p99": p99}}])
     assert verdict == {"verdict": "not met", "quality_needed": pytest.approx(quality), "short_of_rays": told}
+
+
+def test_the_rays_of_an_audit_are_its_own_and_its_room_is_shared_by_events_and_frames(monkeypatch):
+    rooms = []
+
+    def one(self, noted, events, room):
+        rooms.append((noted, events, room))
+        self._source.rays_traced += 700 if events else 90
+        return {"events": events}
+
+    monkeypatch.setattr(Audit, "_one", one)
+    monkeypatch.setattr(Audit, "_verdict", lambda self, parts: {"verdict": parts})
+    for events, frames, own in (("e", "f", 1000), ("e", [], 1000), ([], "f", 3 * 10**9)):
+        rooms.clear()
+        source = SimpleNamespace(rays_traced=own)
+        found = Audit(SimpleNamespace(events=events, frames=frames), source, 0.5, None, np.arange(3), 1).run()
+        assert found["rays"] == (700 if events else 0) + (90 if frames else 0)
+        room = max(audit_module._PART * own, audit_module._RAYS) / (2 if events and frames else 1)
+        assert rooms == [(part, kind, room) for part, kind in ((events, True), (frames, False)) if part]
+        assert found["verdict"] == [{"events": kind} for _, kind, _ in rooms]

@@ -1,11 +1,17 @@
 """Boxes, outlines and speeds of moving objects hold at every instant, keyframes or not."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hesim_render.sources.render.change_driven.neighbours import turns
+from hesim_render.sources.render.change_driven.small_objects import Zoom
 from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.timeline import Timeline
 from hesim_render.sources.render.transport.motion_bounds import fastest_m_per_s, places, places_seen, stays_in
+from hesim_render.sources.render.truth.boxes import _outline
 from hesim_render.specs.motion import TrackSpec
 
 CORNERS = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (0.2, 0.4) for z in (-0.3, 0.0)])
@@ -134,3 +140,45 @@ def test_no_point_is_faster_than_the_fastest():
         points = CORNERS @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
         speed = np.linalg.norm(np.diff(points, axis=0), axis=2).max() / 0.5e-6
         assert speed <= fastest_m_per_s(CORNERS, trajectory, begin, end) * (1 + 1e-6)
+
+
+def test_edges_of_boxes_are_followed_at_every_eighth_where_the_lens_bends_them():
+    """28 lines between the 8 corners of each box, in order of the first corner, with 7 points each."""
+    corners = np.random.default_rng(4).normal(size=(3, 16, 3))
+    bent = SimpleNamespace(_view=SimpleNamespace(projection=SimpleNamespace(distortion="brown")))
+    found = Zoom._along_edges(bent, corners).reshape(3, 2, 8 + 7 * 28, 3)
+    boxes = corners.reshape(3, 2, 8, 3)
+    np.testing.assert_array_equal(found[:, :, :8], boxes)
+    lines = [(i, j) for i in range(8) for j in range(i + 1, 8)]
+    for k in range(7):
+        share = (k + 1) / 8
+        for number, (i, j) in enumerate(lines):
+            expected = (1 - share) * boxes[:, :, i] + share * boxes[:, :, j]
+            np.testing.assert_allclose(found[:, :, 8 + 28 * k + number], expected)
+    assert Zoom._along_edges(bent, corners[:, :9]).shape == (3, 9, 3)  # no boxes
+    straight = SimpleNamespace(_view=SimpleNamespace(projection=SimpleNamespace(distortion=None)))
+    assert Zoom._along_edges(straight, corners) is corners
+
+
+def test_a_sphere_is_outlined_by_the_rays_that_touch_it():
+    """Each point lies on the sphere, and its ray is at right angles to the radius; none from within the sphere."""
+    middle, radius = np.array([0.3, -0.7, -2.0]), 0.6
+    points = _outline(middle, radius)
+    np.testing.assert_allclose(np.linalg.norm(points - middle, axis=1), radius)
+    np.testing.assert_allclose(np.sum(points * (points - middle), axis=1), 0, atol=1e-12)
+    circle = points - points.mean(axis=0)
+    turned = np.sum(circle * np.roll(circle, 1, axis=0), axis=1) / np.sum(circle**2, axis=1)
+    np.testing.assert_allclose(turned, np.cos(2 * np.pi / len(points)))  # evenly, all the way round
+    assert np.isnan(_outline(np.array([0.1, 0.0, 0.2]), 0.3)).all() and np.isnan(_outline(np.zeros(3), 0.1)).all()
+
+
+def test_slices_of_what_does_not_move_are_never_cut():
+    still = Timeline(None, None, {}, {}, np.zeros((8, 3)))
+    assert still.camera_motion_px(0, 1000) == 0 and still.pose_time_us(200, 500) == 350
+    assert still.edges_us(0, 1000).size == 0
+
+
+def test_pairs_know_how_many_windows_of_their_row_come_first():
+    row, window = np.array([4, 2, 4, 2, 2, 4, 4]), np.array([9, 5, 3, 1, 7, 9, 30])
+    assert turns(row, window).tolist() == [1, 1, 0, 0, 2, 1, 2]
+    assert turns(row[:0], window[:0]).size == 0

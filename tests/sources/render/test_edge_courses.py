@@ -1,5 +1,7 @@
 """Edges that are followed from window to window, against lines whose course is known."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -160,3 +162,16 @@ def test_directions_are_joined_across_half_a_turn():
     assert found.window.tolist() == [3, 4, 5, 6]
     chord = pilot[2, 0] + part * (pilot[7, 0] - pilot[2, 0])
     np.testing.assert_allclose(found.model, (pilot[:, 0] - chord)[3:7], atol=2.0)
+
+
+def test_the_share_of_a_pixel_changes_as_a_line_between_two_moves():
+    """Upright lines at 0.1 and 0.7 px of a pixel's middle: 1/px at their mean, 0.4 px; and lines at 30 and 90°."""
+    x, y = np.array([1.0, 1.0, np.cos(np.pi / 6), 0.0]), np.array([0.0, 0.0, 0.5, 1.0])
+    offset = np.array([0.1, 0.7, 0.25, 0.05])
+    fit = SimpleNamespace(normal_x=x, normal_y=y, offset=offset)
+    alone = edge_courses._slope(fit, np.arange(4))
+    np.testing.assert_allclose(alone[[0, 1, 3]], [1, 0, 1], atol=1e-9)
+    first, second = np.array([0, 2, 1]), np.array([1, 3, 1])
+    found = edge_courses._slope(fit, first, second)
+    share = lambda at: halfplane_share(np.cos(np.pi / 3), np.sin(np.pi / 3), 0.15 + at)  # noqa: E731
+    np.testing.assert_allclose(found, [1, (share(0.01) - share(-0.01)) / 0.02, 0], atol=1e-9)

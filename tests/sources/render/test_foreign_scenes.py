@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from rendering import make_scene, mitsuba_scene, mono
 import hesim_render as hr
 from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.isp.develop import _illumination
-from hesim_render.mosaic.schedule import CELL_US
+from hesim_render.mosaic.schedule import BLOCK_INTERVALS, CELL_US
 from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven.estimates import Flux
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
@@ -693,3 +694,26 @@ def test_files_of_an_inline_scene_lie_beside_the_scene_file(tmp_path, monkeypatc
     for name in ("theirs.png", "../elsewhere/theirs.png"):
         with pytest.raises(SpecError):
             hr.SceneTruth(scene(name), sensor).depth(0)
+
+
+def test_a_sliding_camera_is_followed_by_half_of_the_least_distance_at_three_times():
+    """m/s of the camera and of an object, over half the least depth and over that of the object's nearest corner."""
+    shapes = {**FIELD, "camera": camera(fov=60)}
+    scene = make_scene(mitsuba={"inline": shapes})
+    view = place_camera(scene.spec, mono(64, 48), build(mitsuba(), scene.spec).mitsuba_sensor())
+    keys = [{"t_us": 0}, {"t_us": 500_000, "translation_m": [0.3, 0.4, 0]}]
+    slide = Trajectory(TrackSpec.model_validate({"object": "camera", "keyframes": keys}))
+    rest = Trajectory(TrackSpec.model_validate({"object": "card", "keyframes": [{"t_us": 0}, {"t_us": 1}]}))
+    pose = view.camera_to_world
+    # corners 3 and 3.5 m in front of the camera, where it stands at rest
+    corners = pose[:3, 3] - 3.0 * pose[:3, 2] + np.array([[0.1, 0.2, 0.0], [-0.3, 0.1, 0.0]]) @ pose[:3, :3].T
+    corners = np.concatenate([corners, corners - 0.5 * pose[:3, 2]])
+    clock = MotionClock(view, slide, [SimpleNamespace(corners=corners, trajectory=rest)], lambda t: 4.0 - 1e-6 * t)
+    half = np.tan(np.radians(30))
+    stretch = np.sqrt(1 + half**2 + (half * 48 / 64) ** 2)
+    span_us = BLOCK_INTERVALS * CELL_US
+    resting, (own,) = clock._per_metre(2)
+    assert resting == pytest.approx(stretch / (0.5 * (4.0 - 1e-6 * 3 * span_us)), rel=1e-6)
+    # between the three times the camera may come nearer by what it moves in a quarter of the interval, at 1 m/s
+    depth = 3.0 - 0.25e-6 * span_us
+    assert own == pytest.approx(stretch / depth, rel=1e-6)

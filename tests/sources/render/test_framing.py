@@ -12,7 +12,7 @@ import hesim_render as hr
 from hesim_render import cli
 from hesim_render.core.errors import HesimWarning
 from hesim_render.sources.render.camera import place_camera
-from hesim_render.sources.render.framing import framing, warn_if_unseen
+from hesim_render.sources.render.framing import framing, outline, warn_if_unseen
 from hesim_render.sources.render.look import look
 
 LIGHT = {"type": "uniform", "illuminance_lux": 100}
@@ -158,3 +158,25 @@ def test_a_look_at_a_full_sensor_takes_less_than_three_seconds():
             look(hr.load_scene(name), sensor)
             taken.append(time.process_time() - start)
         assert min(taken) < 3
+
+
+def test_the_outline_of_a_target_is_its_rim_in_front_of_the_camera():
+    """f = 20 px; a card of 0.2 × 0.1 m, 0.3 m to the right and 1.25 m in front of a camera 0.25 m behind its place."""
+    camera = {"origin_m": [0, 0, 1], "target_m": [0, 0, 0], "horizontal_fov_deg": 90}
+    back = [{"object": "camera", "keyframes": [{"t_us": 0, "translation_m": [0, 0, 0.25]}, {"t_us": 9}]}]
+    card = {**CARD, "width_m": 0.2, "height_m": 0.1, "position_m": [0.3, 0, 0]}
+
+    def rim(position):
+        scene = scene_of({**card, "position_m": position}, camera, back)
+        return outline(scene.spec, place_camera(scene.spec, mono(40, 30)))
+
+    found = rim([0.3, 0, 0])
+    low, high = np.array([20 + 20 * 0.2 / 1.25, 15 - 20 * 0.05 / 1.25]), np.array([20 + 20 * 0.4 / 1.25, 15.8])
+    np.testing.assert_allclose([found.min(axis=0), found.max(axis=0)], [low, high], rtol=1e-9)
+    on_rim = np.isclose(found, low).any(axis=1) | np.isclose(found, high).any(axis=1)
+    assert on_rim.all() and len(found) == 4 * 32 + 1
+    np.testing.assert_allclose(found[0], found[-1])
+    assert rim([0.3, 0, 1.3]) is None and rim([0.3, 0, 1.2]) is not None
+    tilted = scene_of({**card, "position_m": [0, 0, 1.2], "rotation_deg": 0, "bend_radius_m": 0.05}, camera, back)
+    assert outline(tilted.spec, place_camera(tilted.spec, mono(40, 30))) is None
+    assert outline(scene_of(None, camera, objects=[{"name": "a", "shape": "box"}]).spec, None) is None

@@ -140,3 +140,32 @@ def test_the_option_writes_a_picture_and_prints_what_moves(tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         cli.main([*given, "--out", str(tmp_path / "s"), "--framing"])
     assert ended.value.code == 2 and "give one of --framing, --look and --dry-run" in capsys.readouterr().err
+
+
+def test_the_picture_has_three_colours_and_event_pixels_see_their_mean(monkeypatch):
+    """Reflectances at 610, 545 and 465 nm; each pixel is the mean of nine places a third of a pixel apart."""
+    values = {610: 0.83, 545: 0.31, 465: 0.12}
+    nm = [300, 464, 465, 466, 544, 545, 546, 609, 610, 611, 900]
+    wall = {"name": "wall", "shape": "rectangle", "size_m": [90, 90, 0],
+            "reflectance": {"wavelength_nm": nm, "value": [values.get(one, 0.5) for one in nm]}}  # fmt: skip
+    scene = rendering.make_scene(
+        objects=[wall], light=rendering.D65_1000_LUX,
+        camera={"origin_m": [0, 0, 12], "target_m": [0, 0, 0], "horizontal_fov_deg": 2},
+    )  # fmt: skip
+    seen = motion_look(scene, hr.load_sensor("davis346").crop(4, 2), 0.0, 1000)
+    np.testing.assert_allclose(seen.picture[1, 2], list(values.values()), rtol=1e-3)
+    asked = []
+
+    def brightness(at, nm):
+        asked.append(at)
+        assert list(nm) == [610, 545, 465, 465]
+        bands = np.stack([at.col, 2 * at.col, 6 * at.row, 1000 + 0 * at.row], axis=1)
+        return bands / 100
+
+    mean = look._seen(SimpleNamespace(brightness=brightness), np.array([[2.0, 7.0]]), np.array([[3.0, 5.0]]), 17.0)
+    np.testing.assert_allclose(mean, [[(3 * 2 + 6 * 3) / 300, (3 * 7 + 6 * 5) / 300]])
+    places = np.stack([asked[0].col, asked[0].row]).reshape(2, 9, 2)[:, :, 0] - [[2], [3]]
+    assert sorted(np.rint(3 * places.T).tolist()) == [[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    np.testing.assert_allclose(3 * places, np.rint(3 * places), atol=1e-12)
+    dark = look._seen(SimpleNamespace(brightness=brightness), np.array([[-9.0, 0.0]]), np.array([[3.0, 0.01]]), 17.0)
+    np.testing.assert_allclose(dark, [[1e-4, 2e-4]])  # black has a logarithm

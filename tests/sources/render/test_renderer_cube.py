@@ -127,6 +127,10 @@ def test_bad_cubes_and_files_are_one_clear_error(tmp_path):
         read_spectral_exr(tmp_path / "not.exr")
     with pytest.raises(SpecError, match="no such file"):
         read_spectral_exr(tmp_path / "none.exr")
+    with OpenEXR.File({}, {"S0.500nm": np.zeros((2, 2), dtype=np.float32)}) as file:
+        file.write(str(tmp_path / "bare.exr"))
+    with pytest.raises(SpecError, match="no spectralLayoutVersion"):
+        read_spectral_exr(tmp_path / "bare.exr")
     with OpenEXR.File({}, {"RGB": np.zeros((2, 2, 3), dtype=np.float32)}) as file:
         file.write(str(tmp_path / "rgb.exr"))
     with pytest.raises(SpecError, match="not a spectral EXR"):

@@ -279,6 +279,28 @@ def test_bad_arguments_are_one_clear_error():
     assert np.array(source.mean_flux(np.array([], dtype=np.uint32), 0, 1)[0]).size == 0
 
 
+def test_pixels_of_a_list_lie_on_the_full_sensor_and_have_random_numbers_of_their_own():
+    sensor = mono(8, 6)
+    tracer = RenderedFlux(hr.load_scene("flat-field"), sensor, 4, 7)._tracer
+    index, numbers = sensor.layout.full_index.ravel(), []
+
+    def wavelengths(pixel, u):
+        numbers.append(u)
+        return [500 + 0 * u] * 4
+
+    def drawn(pixel, **more):
+        tracer.trace(pixel, 0.0, 1.0, wavelengths, lambda pixel, radiance: [radiance[0]], **more)
+        return np.array(numbers[-1]).reshape(pixel.size, 4)
+
+    own = drawn(np.arange(48, dtype=np.uint32))
+    np.testing.assert_array_equal(own[[5, 3]], drawn(np.array([5, 3], np.uint32)))
+    other = drawn(np.arange(2, dtype=np.uint32), elsewhere=index[[5, 3]])
+    assert not np.isin(other, own).any()  # 8 numbers of 24 bits
+    np.testing.assert_array_equal(other[:1], drawn(np.array([1], np.uint32), elsewhere=index[[3, 5]]))
+    with pytest.raises(RangeError, match="pixel is 2; expected 0 to 1,"):
+        drawn(np.array([2], np.uint32), elsewhere=index[[3, 5]])
+
+
 def test_light_that_does_not_cover_the_response_is_refused():
     narrow = {"light.illuminant": {"flat": 1.0, "band_nm": [450, 700]}}
     with pytest.raises(SpecError, match=r"flat-field.yaml: light.illuminant: .* only .* of filter 'clear'"):

@@ -248,3 +248,24 @@ def test_rays_leave_the_pupil_through_the_plane_in_focus_with_the_cosine_of_thei
     middle = image_m / np.linalg.norm(start - [0, 0, image_m], axis=1)
     np.testing.assert_allclose(np.array(weight), (cosine / chief / middle) ** 4, rtol=2e-4)
     assert np.ptp(np.array(weight)) > 0.3
+
+
+def test_the_blur_of_points_out_of_focus_grows_with_the_difference_of_their_inverse_depths():
+    """A radius of f/2N · v |1/z − 1/d| in the picture, with v = f (1 + m); none with the lens of a point."""
+    changes = {"lens__f_number": 2.8, "lens__focal_length_mm": 50.0, **LENS}
+    scene = rendering.make_scene(
+        objects=[WALL], light=rendering.FURNACE, camera={"origin_m": [0, 0, 1], "focus_distance_m": 0.3}
+    )
+    view = place_camera(scene.spec, rendering.mono(4, 4, **changes))
+    points = np.array([[[0.01, 0.0, 0.5], [0.0, 0.02, -0.25]]])
+    places, px_per_m = view.project_on_sensor(points, view.camera_to_world[None])
+    focal_px = 50.0 * 300 / 250 / 5e-3
+    np.testing.assert_allclose(px_per_m, [[focal_px / 0.5, focal_px / 1.25]])
+    np.testing.assert_allclose(places[0], [[512 + 0.01 * focal_px / 0.5, 512], [512, 512 - 0.02 * focal_px / 1.25]])
+    pupil_m = 0.05 / 2 / 2.8
+    for number, depth in enumerate((0.5, 1.25)):
+        radius = view.defocus_px(px_per_m[:, number : number + 1])
+        assert radius == pytest.approx(pupil_m * focal_px * abs(1 / depth - 1 / 0.3))
+    assert view.defocus_px(px_per_m) == pytest.approx(pupil_m * focal_px * (1 / 0.3 - 1 / 1.25))
+    sharp = place_camera(scene.spec, rendering.mono(4, 4, **{**changes, "lens__depth_of_field": False}))
+    assert sharp.defocus_px(px_per_m) == 0

@@ -14,6 +14,8 @@ from hesim_render.sources.render.light_level import light_levels
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.truth import imu
 from hesim_render.sources.render.truth.imu import ImuModel
+from hesim_render.sources.render.truth.poses import camera_model
+from hesim_render.sources.render.truth.raster import Raster
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 from hesim_render.specs.motion import TrackSpec
 from hesim_render.spectral.waveform import Mains, Pwm, TableWaveform
@@ -648,3 +650,31 @@ def test_a_step_of_one_mesh_is_mixed_although_its_normals_agree(tmp_path):
     )
     mixed = SceneTruth(hr.load_scene(tmp_path / "step.yaml"), rendering.mono(32, 24)).mixed(0)
     assert mixed.any(axis=1).all() and mixed.sum(axis=1).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("tile", "step", "even"), [("R e G\nB G R", (3.0, 2.0), True), ("R e G\nB G e", (3.0, 1.0), False)]
+)
+def test_grids_of_event_pixels_have_steps_of_their_own_down_and_across(tile, step, even):
+    """Event pixels of tiles of 2 rows and 3 columns, in a region that begins at column 9 and row 4."""
+    grid = {"evs_grid.rows_per_tile": tile.count("e"), "evs_grid.cols_per_tile": 1}
+    size = {"geometry.rows": 40, "geometry.cols": 66}
+    sensor = hr.load_sensor("mipi-hybridevs", {**size, **grid, "tile": tile}).crop(12, 8, 9, 4)
+    raster = Raster.of(sensor, "events")
+    places = np.argwhere(np.tile([[c == "e" for c in line.split()] for line in tile.split("\n")], (4, 4)))
+    assert raster.step == step and raster.first == (9, 4) and raster.is_even == even
+    np.testing.assert_array_equal(raster.row.ravel(), places[:, 0] + 4)
+    np.testing.assert_array_equal(raster.col.ravel(), places[:, 1] + 9)
+    number = np.indices(raster.shape)
+    origin = np.mean([raster.col - step[0] * number[1], raster.row - step[1] * number[0]], axis=(1, 2))
+    assert raster.origin_px == pytest.approx(tuple(origin))
+    found = raster.to_grid(np.array([[11.0, 17.0], [30.5, 4.0]]))
+    np.testing.assert_allclose(found, (np.array([[11.0, 17.0], [30.5, 4.0]]) - origin) / step)
+    projection = SimpleNamespace(focal_px=480.0, centre_px=(33.0, 19.0))
+    optics = SimpleNamespace(distortion=SimpleNamespace(model="opencv", coefficients=(0.1, 0.2)))
+    rays = SimpleNamespace(view=SimpleNamespace(projection=projection), sensor=SimpleNamespace(optics=optics))
+    made = camera_model(rays, raster).as_dict()
+    centre = (np.array([33.0, 19.0]) - origin) / step
+    np.testing.assert_allclose(made["k"], [[160, 0, centre[0]], [0, 480 / step[1], centre[1]], [0, 0, 1]])
+    assert (made["width"], made["height"]) == raster.shape[::-1] and made["is_even"] == even
+    assert (made["distortion_model"], made["distortion"]) == ("opencv", [0.1, 0.2])

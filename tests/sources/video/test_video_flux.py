@@ -545,3 +545,18 @@ def test_only_pictures_of_the_run_are_read_for_the_estimate():
         estimate(pictures)
     flux = source(pictures)
     assert flux.seconds_per_picture(1) == 0  # the first one is read in any case
+
+
+def test_pictures_made_between_those_of_a_video_divide_the_time_between_their_middles():
+    """Periods of 10, 6 and 24 ms at twice the speed, open for 0.4 of each; three pictures from each one."""
+    clock = Clock(Timing(np.array([0, 0.010, 0.016]), 0.040), slow_motion=2, duty=0.4, factor=3)
+    given = np.array([1000.0, 5600.0, 10_400.0])
+    expected = [given[0] + k / 3 * 4600 for k in range(3)] + [given[1] + k / 3 * 4800 for k in range(4)]
+    np.testing.assert_allclose(clock.middle_us, expected)
+    between = (clock.middle_us[1:] + clock.middle_us[:-1]) / 2
+    np.testing.assert_allclose(clock.hold_us, [0, *between, 20_000])
+    assert clock.count == 7 and clock.period_us == pytest.approx((4600 / 3 + 4800 / 3) / 2)
+    single = Clock(Timing(np.array([0.0]), 0.040), slow_motion=2)
+    assert single.count == 1 and single.period_us == 20_000
+    times = np.array([3.0, 5.0, 8.0, 9.0])
+    assert clock.inner(times, 3.0, 9.0).tolist() == [5, 8] and clock.inner(times, 2.9, 9.1).tolist() == [3, 5, 8, 9]

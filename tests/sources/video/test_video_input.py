@@ -607,3 +607,10 @@ def test_the_hash_is_made_beside_the_run_and_its_errors_are_told():
 def test_an_input_without_its_data_cannot_be_made():
     with pytest.raises(TypeError, match="_pieces"):
         Hashed()
+
+
+def test_a_folder_names_its_first_and_last_picture(tmp_path):
+    for name in ("11.png", "9.png", "10.png"):
+        Image.fromarray(np.zeros((4, 6), np.uint8)).save(tmp_path / name)
+    facts = opened(tmp_path, fps=10).describe()
+    assert (facts["first"], facts["last"], facts["pictures"], facts["size_px"]) == ("9.png", "11.png", 3, [6, 4])
