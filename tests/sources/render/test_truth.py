@@ -13,6 +13,7 @@ from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sources.render.light_level import light_levels
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.truth import imu
+from hesim_render.sources.render.truth.flow import _unhidden
 from hesim_render.sources.render.truth.imu import ImuModel
 from hesim_render.sources.render.truth.poses import camera_model
 from hesim_render.sources.render.truth.raster import Raster
@@ -678,3 +679,48 @@ def test_grids_of_event_pixels_have_steps_of_their_own_down_and_across(tile, ste
     np.testing.assert_allclose(made["k"], [[160, 0, centre[0]], [0, 480 / step[1], centre[1]], [0, 0, 1]])
     assert (made["width"], made["height"]) == raster.shape[::-1] and made["is_even"] == even
     assert (made["distortion_model"], made["distortion"]) == ("opencv", [0.1, 0.2])
+
+
+@pytest.mark.parametrize("is_global", [True, False])
+def test_what_may_hide_a_point_is_looked_for_from_the_camera_at_the_time_of_its_row(is_global):
+    """Between two tabulated poses of camera and object, as far as the row is; points of the sky have none in front."""
+
+    def poses(seed, *shape):
+        made = np.broadcast_to(np.eye(4), (*shape, 4, 4)).copy()
+        rng = np.random.default_rng(seed)
+        made[..., :3, :3] = Rotation.random(int(np.prod(shape)), random_state=seed).as_matrix().reshape(*shape, 3, 3)
+        made[..., :3, 3] = rng.normal(size=(*shape, 3))
+        return made
+
+    camera, groups = poses(1, 3), poses(2, 2, 3)
+    low, share = np.array([0, 1, 1, 0]), np.array([0.25, 0.5, 0.75, 0.4])
+    after = SimpleNamespace(
+        camera=camera, groups=groups, is_global=is_global, between=lambda rows: (low, low + 1, share),
+        times_at=lambda rows: 10 * rows,
+    )  # fmt: skip
+    before = SimpleNamespace(camera=poses(3, 2), groups=poses(4, 2, 2), index=lambda rows: rows % 2)
+    points = np.random.default_rng(5).normal(size=(4, 4))
+    points[:, 3] = 1
+    seen = []
+    rays = SimpleNamespace(
+        sensor=SimpleNamespace(layout=SimpleNamespace(row0=7)),
+        sees=lambda there, t_us, origin: seen.append((there, t_us, origin)) or [True, False, True],
+        sees_sky=lambda there, t_us, origin: seen.append((there, t_us, origin)) or [True],
+    )
+    asked = []
+    surfaces = SimpleNamespace(points=lambda *given: asked.append(given) or points)
+    which, row, group = np.array([1, 2, 4, 5]), np.arange(6) + 3, np.array([9, 0, 1, 9, 0, 1])
+    distance = np.array([9, 1.0, 2.0, 9, np.inf, 4.0], np.float32)
+    corner = np.arange(12.0).reshape(6, 2)
+    found = _unhidden(rays, after, before, surfaces, group, np.arange(6), row, which, corner, distance)
+    assert found.tolist() == [True, False, True, True] and asked[0][1].tolist() == (row[which] + 7).tolist()
+    part = np.zeros(4) if is_global else share
+    for k, (n, own) in enumerate(zip(which, (0, 1, 3, 2), strict=True)):
+        g = group[n]
+        rest = np.linalg.inv(before.groups[g, row[n] % 2]) @ points[k]
+        pose = (1 - part[k]) * groups[g, low[k]] + part[k] * groups[g, low[k] + 1]
+        origin = ((1 - part[k]) * camera[low[k]] + part[k] * camera[low[k] + 1])[:3, 3]
+        there, t_us, at = (np.concatenate([one[j] for one in seen])[own] for j in range(3))
+        np.testing.assert_allclose(there, (pose @ rest)[:3])
+        np.testing.assert_allclose(at, origin)
+        assert t_us == 10 * corner[n, 1]
