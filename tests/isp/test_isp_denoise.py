@@ -14,7 +14,7 @@ from hesim_render.isp import FrameNoise, collaborate, rows
 from hesim_render.isp import denoise as denoising
 from hesim_render.isp.denoise import _each, denoise
 from hesim_render.isp.rows import row_offsets
-from hesim_render.isp.stabilise import Stabiliser
+from hesim_render.isp.stabilise import Stabiliser, _padded_index
 
 FIVE = ((0, 1, 0, 1, 2), (1, 2, 1, 0, 1), (0, 1, 2, 1, 0), (1, 0, 1, 2, 1), (2, 1, 0, 1, 0))
 TILES = {"bayer": BAYER, "quad": QUAD, "mipi": MIPI, "eiger": EIGER, "five": FIVE, "mono": ((0,),)}
@@ -402,3 +402,15 @@ def test_means_of_blocks_are_samples_a_block_apart(monkeypatch):
     assert blocks.channel.tolist() == [0] * 4 + [1] * 4 and blocks.amplitude.tolist() == [5.0] * 4 + [9.0] * 4
     np.testing.assert_allclose(seen[1][1], 2 * blocks.values, rtol=1e-6)
     np.testing.assert_allclose(found, 2 * means, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("size", "period"), [(12, 4), (13, 4), (15, 5), (7, 5), (3, 5), (1, 4), (4, 4)])
+def test_borders_of_a_line_repeat_its_outermost_whole_blocks(size, period):
+    """A line shorter than a block is repeated by itself."""
+    expected = []
+    for number in range(-period, -(-size // period) * period + period):
+        place = number + period if number < 0 else number
+        while place >= size:
+            place -= period
+        expected.append(place if place >= 0 else (number + period) % min(size, period))
+    assert _padded_index(size, period).tolist() == expected
