@@ -102,13 +102,16 @@ def compare(result: PairCalibration, held: PairSet, real: Half, twin: Half) -> l
     result : what was fitted, to the other half.
     held : the captures that were held out.
     real, twin : their figures and those of the twin.
+
+    Where rounding hides the dark noise, the calibration does not know it, and nothing in the dark is compared.
     """
-    return [
+    checks = [
         *_temporal(result, held, real, twin),
         *_end(result, real, twin),
         *_shared(result, real, twin),
         *_spatial(result, real, twin),
     ]
+    return [check for check in checks if not (result.dark_noise_is_rounded_off and check.name.endswith("dark"))]
 
 
 def _temporal(result: PairCalibration, held: PairSet, real: Half, twin: Half) -> list[Check]:

@@ -120,6 +120,15 @@ def test_twins_of_unlike_sensors_pass(tmp_path, name):
     assert ("light of the long series" in named) == (name == "light that drifts")
 
 
+def test_where_rounding_hides_the_dark_noise_lit_frames_are_compared(tmp_path):
+    """A dark noise of 0.22 DN at 8 bit: 9 statistics in the light; the others would fail by what is not known."""
+    camera = levels(NARROW.but(gain=0.0155, black=3.5, read_noise=14.0, dsnu=(2.0, 4.0, 8.0)), 1.08, 0.5)
+    twin = make_twin(camera.write(tmp_path / "set", 8), tmp_path / "twin")
+    assert len(twin.checks) == 9 and all(check.name.endswith("lit") for check in twin.checks)
+    assert twin.passed, [(c.name, c.worst, c.rms) for c in twin.checks if not c.passed]
+    assert any("no dark frames are compared" in finding.text for finding in twin.findings)
+
+
 @pytest.mark.parametrize("factor", (0.93, 1.0, 1.07))
 def test_where_a_full_well_ends_is_compared(tmp_path, monkeypatch, factor):
     """Levels beyond saturation tell it, also where the twin's is too large to be seen at any level below."""
