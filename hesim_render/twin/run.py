@@ -97,7 +97,7 @@ def make_twin(
         checks = compare(result, held, real, twin)
         own_findings = findings(result)
         if result.dark_noise_is_rounded_off:
-            text = "rounding hides the dark noise, which the twin has from lit levels alone: no dark frames are compared"
+            text = "rounding hides the dark noise, which follows from lit levels alone: no dark frames are compared"
             own_findings.append(Finding("twin", text, None))
         (folder.path / RESULT_NAME).write_text(_json(checks, seed), encoding="utf-8")
         texts = [finding.text for finding in own_findings]
