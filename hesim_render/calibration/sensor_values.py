@@ -105,7 +105,7 @@ def _aps_values(own: Mapping[str, Any], data: CalibrationSpec, aps: FrameSection
         if getattr(aps, key) is not None:
             values[key] = getattr(aps, key)
     if aps.full_well_e.limited_by == "full well":
-        values["full_well_e"] = aps.full_well_e.value
+        values["full_well_e"] = aps.full_well_e.cut_off_e or aps.full_well_e.value
     for key, item, scale in (
         ("read_noise_e", aps.read_noise_e, 1.0),
         ("dark_current_e_per_s", aps.dark_current_e_per_s, 1.0),

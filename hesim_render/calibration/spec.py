@@ -75,6 +75,9 @@ class FullWell(EstimateSpec):
     """Saturation capacity."""
 
     limited_by: Literal["ADC full scale", "full well"] | None = None
+    cut_off_e: float | None = Field(
+        None, gt=0, description="where pixels are cut off; `value` is a level that the full well leaves whole"
+    )
 
 
 class FindingSpec(_Section):

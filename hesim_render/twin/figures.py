@@ -123,9 +123,12 @@ def without_defects(series: Long, defects: NDArray[np.bool_]) -> Long:
         profiles.append(total / np.maximum(count, 1))
     plain = level + profiles[0][:, None] + profiles[1]
     mean = np.where(good, series.mean, plain)
-    less = float(series.variance.mean(dtype=np.float64) - series.variance[good].mean(dtype=np.float64))
+    usual = float(series.variance[good].mean(dtype=np.float64))
+    less = float(series.variance.mean(dtype=np.float64)) - usual
     temporal = replace(series.temporal, pixel=series.temporal.pixel - less)
-    return replace(series, mean=mean, temporal=temporal, spatial=spatial_variance(mean, temporal, series.frames))
+    variance = np.where(good, series.variance, np.float32(usual))
+    spatial = spatial_variance(mean, temporal, series.frames, variance)
+    return replace(series, mean=mean, variance=variance, temporal=temporal, spatial=spatial)
 
 
 def deviations(image: NDArray) -> NDArray[np.float64]:

@@ -10,9 +10,62 @@ import pytest
 from hesim_render.calibrate.aps import pair_levels
 from hesim_render.calibrate.aps.pairs import _relative, evaluate
 from hesim_render.calibrate.aps.pairs_findings import findings
-from hesim_render.calibrate.aps.spatial import Temporal, pattern_of, spatial_variance
+from hesim_render.calibrate.aps.pairs_output import calibrate_pairs, content
+from hesim_render.calibrate.aps.sensor_file import write_sensor
+from hesim_render.calibrate.aps.spatial import Temporal, outliers, pattern_of, spatial_variance
+from hesim_render.sensor.sensor import load_sensor
 
 CAMERA = emva_camera.Camera()
+
+
+def test_hot_pixels_are_in_no_profile_of_their_rows_and_columns():
+    """Pixels of +500 DN move the mean of a column by 4 DN; the others, of as much noise as pattern, do not."""
+    rng, (rows, cols) = np.random.default_rng(11), (120, 90)
+    own = 0.8 * rng.standard_normal(cols) + 0.3 * rng.standard_normal((rows, cols))
+    hot = rng.integers(0, rows * cols, 40)
+    own.flat[hot] += 500.0
+    noise = 0.09
+    image = own + np.sqrt(noise) * rng.standard_normal((rows, cols))
+    found = pattern_of(image, (noise / cols, noise / rows, noise))
+    assert abs(found.whole.mean()) < 1e-4
+    deviation = found.whole - own
+    deviation -= deviation.mean()
+    # noise of a column's mean is 0.03 DN; by means over all pixels 1 DN
+    assert deviation.mean(axis=0).std() < 0.04 and deviation.mean(axis=1).std() < 0.04
+    assert np.flatnonzero(outliers(image, (noise / cols, noise / rows, noise))).tolist() == sorted(set(hot.tolist()))
+
+
+def test_stuck_pixels_are_defects_and_not_saturation():
+    """Six white pixels and a dead row, a 40th of the frame: the figures are those of the others."""
+    camera = CAMERA.but(rows=40, white=6, dead_row=7)
+    result = evaluate(emva_camera.in_memory(camera, 12))
+    found = content(result)
+    assert abs(found["K"]["value"] / camera.gain - 1) < 0.02
+    assert result.clear.sum() >= 15 and found["bad_pixels"] >= 6 + camera.cols
+    (named,) = [f["text"] for f in found["findings"] if f["check"] == "stuck pixels"]
+    assert re.match(r"[56] pixels are at full scale in the dark, 5[12] at 0 DN in the light", named)
+
+
+@pytest.mark.parametrize("lag", (0.0, 0.02))
+def test_light_that_stays_for_the_next_frame_is_named(lag):
+    """Lit and dark pairs in turn: the first in the dark has up to 100 DN of the light before; no values lack."""
+    camera = CAMERA.but(rows=64, cols=90, lag=lag, row_noise=0.0)
+    found = content(evaluate(emva_camera.in_memory(camera, 14)))
+    named = [f["text"] for f in found["findings"] if f["check"] == "image lag"]
+    assert len(named) == (lag > 0) and all(re.match(r"the first dark frame of a pair is \d+ DN bri", n) for n in named)
+    assert found["K"]["value"] == pytest.approx(camera.gain, rel=0.03)
+
+
+def test_pixels_are_cut_off_where_the_brightest_level_is(tmp_path):
+    """EMVA's saturation is a level that the full well leaves whole; pixels of the sensor file end above it."""
+    camera = CAMERA.but(full_well=7100.0, prnu=(0.001, 0.001, 0.004))
+    result = calibrate_pairs(emva_camera.in_memory(camera, 13), tmp_path / "c.yaml")
+    well = content(result)["full_well_e"]
+    assert well["limited_by"] == "full well" and well["value"] < 0.98 * 7100
+    # K is known to 2 %
+    assert well["cut_off_e"] == pytest.approx(7100, rel=0.03)
+    sensor = load_sensor(write_sensor(tmp_path / "s.yaml", tmp_path / "c.yaml", result))
+    assert sensor.spec.aps.full_well_e == pytest.approx(well["cut_off_e"])
 
 
 def test_hot_pixels_do_not_widen_the_range_of_grey_values_that_are_expected():

@@ -240,7 +240,7 @@ def test_the_sensor_file_of_captures_has_their_figures(tmp_path, seen, limit):
         spatial_lit=SimpleNamespace(exposure_s=0.0304),
     )  # fmt: skip
     result = SimpleNamespace(
-        gain=SimpleNamespace(slope=0.4), pairs=pairs, saturation=1, signal=np.array([100.0, 800.0]), top_dn=800.0,
+        gain=SimpleNamespace(slope=0.4), pairs=pairs, saturation=1, signal=np.array([100.0, 800.0]), brightest_dn=800.0,
         lit=SimpleNamespace(high=np.array([0.9, seen])), responsivity=SimpleNamespace(slope=0.23),
         black=SimpleNamespace(value=61.5, slope=17.0), noise=SimpleNamespace(value=8.9),
     )  # fmt: skip

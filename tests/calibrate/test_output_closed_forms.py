@@ -42,7 +42,8 @@ def calibration(**changed):
         "black": SimpleNamespace(value=40.0, slope=17.0, slope_error=0.7, groups=5, rms=0.002),
         "lines_dn2": 0.7, "row": (0.62, 0.05), "col": (0.04, 0.03),
         "light": np.array([100.0, 300.0, 900.0, 1500.0]), "saturation": 2, "signal": np.array([22.0, 66, 190, 200]),
-        "clear": np.array([1, 1, 0, 0], bool), "lit": lit_pairs(),
+        "clear": np.array([1, 1, 0, 0], bool), "lit": lit_pairs(), "brightest_dn": 207.0,
+        "dark": SimpleNamespace(exposure_s=np.array([0.1, 0.2, 0.3, 0.3]), change=np.array([0.3, -0.3, 0.2, 0.2])),
         "long_dark": SimpleNamespace(spatial=spatial_dark, mean=mean, temporal=dark_noise),
         "long_lit": SimpleNamespace(spatial=spatial_lit, mean=mean + 120, temporal=lit_noise, frames=16),
         "linearity": (np.array([1, 0, 1, 1], bool), np.array([-0.4, 0.1, 0.9])),
@@ -101,7 +102,7 @@ def test_efficiency_dark_current_and_full_well_of_emva_captures():
     found = full_well(1, variance=[2.3, 19.0, 6.1, 18.9], **few)
     assert found["limited_by"] == "ADC full scale"
     found = full_well(1, variance=[2.3, 19.0, 6.1, 18.9], high=[0.5, 0.01, 0.01, 0.009])
-    assert found["limited_by"] == "full well"
+    assert found["limited_by"] == "full well" and found["cut_off_e"] == pytest.approx(207 / K)
     assert found["interval_95"] == pytest.approx([per_photon * 100 * (1 - Z * RELATIVE), 200 / K * (1 + Z * RELATIVE)])
     found = full_well(1, variance=[2.3, 19.0, 18.4, 6.1], full_scale_dn=300)
     assert found["interval_95"][1] == pytest.approx(per_photon * 1500 * (1 + Z * RELATIVE))
@@ -196,6 +197,18 @@ def test_findings_of_emva_captures_begin_at_their_limits():
     for more in (0.99, 1.01, -0.99, -1.01):
         changed = SimpleNamespace(**{**lit, "mean": np.full((14, 22), 40 + expected * (1 + more * limit))})
         assert ("light of the long series" in named(long_lit=changed)) is (abs(more) > 1)
+    # three dark pairs of different exposures, 1 DN apart, whose mean is 3.9 of its errors
+    for most, is_seen in ((3.9, False), (3.9 * 1.01, True)):
+        change = np.array([-1.0, 0.0, 1.0, 9.0]) + most / np.sqrt(3)
+        dark = SimpleNamespace(exposure_s=np.array([0.1, 0.2, 0.3, 0.3]), change=change)
+        assert ("image lag" in named(dark=dark)) is is_seen
+    for size in (0.049, 0.051):
+        dark = SimpleNamespace(exposure_s=np.arange(16.0), change=size + 0.04 * (-1) ** np.arange(16))
+        assert ("image lag" in named(dark=dark)) is (size > 0.05)
+    assert "stuck pixels" not in named()
+    mean = calibration().long_lit.mean.copy()
+    mean[3, 5] = 0.4
+    assert "stuck pixels" in named(long_lit=SimpleNamespace(**{**lit, "mean": mean}))
     other = SimpleNamespace(**{**vars(calibration().pairs), "spatial_lit": SimpleNamespace(photons=301.0)})
     assert "light of the long series" not in named(pairs=other)  # beyond the brightest clear level
 

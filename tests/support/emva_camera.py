@@ -32,6 +32,9 @@ class Camera:
     full_well: float = np.inf  # e-
     hum: float = 0.0  # DN, of a checkerboard with a new phase in each frame
     hot: int = 0  # pixels of many times the dark current
+    white: int = 0  # pixels that are always at full scale
+    dead_row: int | None = None  # whose pixels are always 0
+    lag: float = 0.0  # part of the electrons that stays for the next frame
     softness: float = 0.0  # e-, over which the full well is reached
     light_drift: float = 0.0  # relative, from no exposure to the longest; long series after it
     exposures_us: tuple[float, ...] = tuple(float(t) for t in np.linspace(400, 24_000, 18).round())
@@ -55,7 +58,9 @@ class Camera:
         currents = np.full(shape, self.dark_current)
         own = np.random.default_rng([seed, 1])
         currents.flat[own.integers(0, currents.size, self.hot)] *= own.uniform(20, 200, self.hot)
+        white = np.random.default_rng([seed, 2]).integers(0, currents.size, self.white)
         longest = max(self.exposures_us)
+        left = np.zeros(shape)
         grid = np.add.outer(np.arange(self.rows), np.arange(self.cols))
 
         def frame(lit, exposure_us, photons_per_us):
@@ -65,9 +70,12 @@ class Camera:
                 late = 1.0 if exposure_us == self.long_us else exposure_us / longest
                 light = light * (1 + self.light_scatter * rng.standard_normal()) * (1 + self.light_drift * late)
             electrons = rng.poisson(light + currents * exposure_us * 1e-6)
+            if self.lag:
+                here, left[:] = left.copy(), self.lag * electrons
+                electrons = electrons - left + here
             if self.softness:
-                left = self.full_well - electrons
-                electrons = self.full_well - self.softness * np.logaddexp(0, left / self.softness)
+                left_e = self.full_well - electrons
+                electrons = self.full_well - self.softness * np.logaddexp(0, left_e / self.softness)
             signal = self.gain * np.minimum(electrons, self.full_well)
             signal = signal * (1 + self.bend * signal / (2**self.bits - 1))
             noise = rng.standard_normal((self.rows, self.cols + 1))
@@ -78,6 +86,9 @@ class Camera:
             value = value + self.row_noise * rng.standard_normal((self.rows, 1))
             value = value + self.column_noise * rng.standard_normal(self.cols)
             value = value + np.sqrt(2) * self.hum * np.cos(np.pi * grid + 2 * np.pi * rng.random())
+            value.flat[white] = 2**self.bits
+            if self.dead_row is not None:
+                value[self.dead_row] = 0.0
             return np.clip(np.rint(value), 0, 2**self.bits - 1).astype(np.uint16)
 
         def frames(lit, exposure_us, count, photons_per_us=self.photons_per_us):

@@ -6,7 +6,8 @@ import pytest
 from emva_makers import MAKERS, Maker
 from emva_makers import NARROW as MAKERS_8
 
-from hesim_render.twin import make_twin
+from hesim_render.sensor.sensor import load_sensor
+from hesim_render.twin import make_twin, run
 
 CAMERA = emva_camera.Camera(
     rows=72, cols=104, column_noise=0.7, bend=-0.03, long_frames=16,
@@ -84,6 +85,14 @@ SENSORS = {
         levels(NARROW.but(gain=0.05, black=8.3, read_noise=8.2, dsnu=(2.0, 4.0, 6.0)), 1.08, 0.5),
         MAKERS_8["BMP of three equal colours"],
     ),
+    "full well, hot pixels": (
+        levels(PLAIN.but(gain=0.29, full_well=9400.0, hot=40), 0.9, 0.31),
+        MAKERS["values to the left, milliseconds"],
+    ),
+    "stuck pixels and a dead row": (
+        levels(PLAIN.but(white=9, dead_row=31, column_noise=0.3), 1.08, 0.5),
+        MAKERS["a table of semicolons with paths of another machine"],
+    ),
     "light that drifts": (levels(PLAIN.but(light_drift=0.015), 1.08, 0.5), MAKERS["values to the left, milliseconds"]),
     "saturated series": (levels(PLAIN, 1.8, 0.5), MAKERS["PGM, a line for each picture, UTF-16"]),
 }
@@ -109,6 +118,32 @@ def test_twins_of_unlike_sensors_pass(tmp_path, name):
     assert twin.passed, [(c.name, c.worst, c.rms) for c in twin.checks if not c.passed]
     named = {finding.check for finding in twin.findings}
     assert ("light of the long series" in named) == (name == "light that drifts")
+
+
+def test_where_rounding_hides_the_dark_noise_lit_frames_are_compared(tmp_path):
+    """A dark noise of 0.22 DN at 8 bit: 9 statistics in the light; the others would fail by what is not known."""
+    camera = levels(NARROW.but(gain=0.0155, black=3.5, read_noise=14.0, dsnu=(2.0, 4.0, 8.0)), 1.08, 0.5)
+    twin = make_twin(camera.write(tmp_path / "set", 8), tmp_path / "twin")
+    assert len(twin.checks) == 9 and all(check.name.endswith("lit") for check in twin.checks)
+    assert twin.passed, [(c.name, c.worst, c.rms) for c in twin.checks if not c.passed]
+    assert any("no dark frames are compared" in finding.text for finding in twin.findings)
+
+
+@pytest.mark.parametrize("factor", (0.93, 1.0, 1.07))
+def test_where_a_full_well_ends_is_compared(tmp_path, monkeypatch, factor):
+    """Levels beyond saturation tell it, also where the twin's is too large to be seen at any level below."""
+    camera = levels(PLAIN.but(gain=0.29, full_well=9400.0), 1.0, 0.31)
+    folder = camera.write(tmp_path / "set", 6)
+
+    def wrong(file):
+        spec = load_sensor(file).spec.aps
+        return load_sensor(file, {"aps.full_well_e": factor * spec.full_well_e})
+
+    monkeypatch.setattr(run, "load_sensor", wrong)
+    twin = make_twin(folder, tmp_path / "twin")
+    failed = {check.name for check in twin.checks if not check.passed}
+    assert len(twin.checks) == 21 and ("end of the signal, lit" in failed) == (factor != 1.0)
+    assert failed <= {"end of the signal, lit"} or factor < 1.0
 
 
 @pytest.mark.slow

@@ -338,8 +338,9 @@ def test_spatial_checks_are_relative_to_each_ones_own_signal(monkeypatch):
     monkeypatch.setattr(comparison, "without_defects", lambda series, defects: series)
     monkeypatch.setattr(comparison, "spectra", spectra)
     result = SimpleNamespace(
-        lit=None, dark=None, long_dark=own.long_dark, long_lit=own.long_lit, noise_spectrum=None, defects=None
-    )
+        lit=None, dark=None, long_dark=own.long_dark, long_lit=own.long_lit, noise_spectrum=None, defects=None,
+        pairs=SimpleNamespace(spec=SimpleNamespace(full_scale_dn=4095)),
+    )  # fmt: skip
     found = {check.name: check for check in comparison._spatial(result, real, twin)}
     signal = [h.long_lit.mean.mean() - h.long_dark.mean.mean() for h in (real, twin, own)]
     assert powers == pytest.approx([1, 1, 1, *signal])

@@ -13,6 +13,9 @@ from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal, spatia
 from hesim_render.calibrate.moments import FrameMoments, Progress, measure
 from hesim_render.recording.pair_set import PairSet
 
+#: Part of the pixels at full scale in the dark that are taken for defects; more are a dark series that is lit.
+_MOST_STUCK = 0.01
+
 
 @dataclass(frozen=True)
 class Long:
@@ -38,27 +41,44 @@ class Long:
     spectrum: NoiseSpectrum | None
 
 
-def long_series(pairs: PairSet, is_lit: bool, progress: Progress | None) -> Long:
-    """Read and check the long series of a set, lit or dark."""
+def long_series(pairs: PairSet, progress: Progress | None) -> tuple[Long, Long]:
+    """Read and check the long series of a set: dark and lit."""
+    dark, white = _read(pairs, False, progress, None)
+    lit, _ = _read(pairs, True, progress, white)
+    return dark, lit
+
+
+def stuck_pixels(full_scale_dn: int, dark: Long, lit: Long) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pixels at full scale in the dark, and those at 0 in the light."""
+    return np.asarray(dark.mean >= full_scale_dn - 0.5), np.asarray(lit.mean <= 0.5)
+
+
+def _read(
+    pairs: PairSet, is_lit: bool, progress: Progress | None, stuck: NDArray[np.bool_] | None
+) -> tuple[Long, NDArray[np.bool_]]:
+    """One series, and its pixels at full scale; in the light, those that are so in the dark do not count."""
     series = pairs.spatial_lit if is_lit else pairs.spatial_dark
     used = np.ones(pairs.shape, bool)
     full = pairs.spec.full_scale_dn
     stack = SpatialStack(pairs, series, progress)
     moments = measure(stack, used, full)
-    clipped = float(np.mean(moments.highest[0] >= full))
-    if clipped > CLIPPED_SHARE and float(np.mean(moments.mean[0] >= full - 0.5)) > CLIPPED_SHARE:
+    mean = moments.mean[0].astype(np.float64)
+    white = np.asarray(mean >= full - 0.5)
+    light = np.ones(pairs.shape, bool) if stuck is None else ~stuck
+    clipped = float(np.mean((moments.highest[0] >= full) & light))
+    most = CLIPPED_SHARE if is_lit else _MOST_STUCK
+    if clipped > most and float(np.mean(white & light)) > most:
         raise series.error(
             f"{100 * clipped:.3g} % of the pixels of the long series are saturated; EMVA 1288 takes it at 50 % of "
             "saturation"
         )
-    mean = moments.mean[0].astype(np.float64)
     levels = moments.row_means[0].mean(axis=1)
     if is_lit and np.ptp(levels) > MOST_CHANGE * mean.mean():
         raise series.error(
             f"the light drifts: the frames of the long series differ by {100 * np.ptp(levels) / mean.mean():.2g} %; "
             "warm the light up and keep it steady"
         )
-    return long_of(moments, None if is_lit else noise_spectrum(stack, mean))
+    return long_of(moments, None if is_lit else noise_spectrum(stack, mean)), white
 
 
 def long_of(moments: FrameMoments, spectrum: NoiseSpectrum | None) -> Long:

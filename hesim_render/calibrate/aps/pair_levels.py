@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ _EXPECTED = 50.0
 _GAPS = 0.1
 #: Part of the pixels at an end of the ADC's range from which a variance is not that of the light.
 CLIPPED_SHARE = 1e-4
+#: Part of the pixels at full scale up to which saturated levels are those of a full well and not of the ADC.
+WELL_SHARE = 0.01
 #: Change of the light between frames of one series that is refused.
 MOST_CHANGE = 0.02
 _SIGMAS = 6.0
@@ -40,7 +42,7 @@ class Levels:
     row, col : variance of what rows and columns get anew in each frame, DN²; unbiased, hence possibly negative.
     row_error, col_error : their standard errors.
     squares : mean over pixels of the squared variance of one pixel, DN⁴.
-    low, high : part of the pixels at 0 and at full scale.
+    low, high : part of the pixels at 0 and at full scale; of `both_levels` without those that are stuck there.
     """
 
     exposure_s: NDArray[np.float64]
@@ -89,6 +91,24 @@ def pair_levels(pairs: PairSet, series: tuple[Series, ...], progress: Progress |
     result = dict(zip(different, results, strict=True))
     photons = [0.0 if not s.lit else np.nan if s.photons is None else s.photons for s in series]
     return levels([s.exposure_s for s in series], photons, [result[s] for s in series])
+
+
+def both_levels(pairs: PairSet, progress: Progress | None = None) -> tuple[Levels, Levels]:
+    """The lit and the dark pairs of a set.
+
+    Pixels that are at full scale in the dark of the same exposure, or at 0 in every light, are defects: neither has to
+    do with the light or with the black level.
+    """
+    return without_stuck(pair_levels(pairs, pairs.lit, progress), pair_levels(pairs, pairs.dark, progress))
+
+
+def without_stuck(lit: Levels, dark: Levels) -> tuple[Levels, Levels]:
+    """Lit and dark levels whose pixels at the ends of the range are those that light or noise brings there."""
+    dead = lit.low.min()
+    return (
+        replace(lit, low=lit.low - dead, high=np.maximum(lit.high - dark.high, 0.0)),
+        replace(dark, low=np.maximum(dark.low - dead, 0.0)),
+    )
 
 
 def levels(exposure_s: Iterable[float], photons: Iterable[float], statistics: list[tuple[float, ...]]) -> Levels:
@@ -150,12 +170,20 @@ def _check(entry: Series, statistics: tuple[float, ...], first: NDArray, second:
 
 
 def _gaps(first: NDArray, second: NDArray, full: int) -> tuple[int, int]:
-    """Grey values near the mean that no pixel has, and how many were expected.
+    """Grey values near the mean that no pixel has, and how many were expected; of the frame that lacks more.
+
+    Each frame has its own range: after light, the first in the dark may be brighter (image lag).
+    """
+    return max((_gaps_of(frame, full) for frame in (first, second)), key=lambda gaps: gaps[0] / max(gaps[1], 1))
+
+
+def _gaps_of(frame: NDArray, full: int) -> tuple[int, int]:
+    """Those of one frame.
 
     The range is that of the middle 87 % of the pixels: a few hot pixels, or masked ones, would widen a standard
     deviation. One gap alone lies between two groups of pixels, as those of two read-outs.
     """
-    counts = np.bincount(first.ravel(), minlength=full + 1) + np.bincount(second.ravel(), minlength=full + 1)
+    counts = np.bincount(frame.ravel(), minlength=full + 1)
     below = np.cumsum(counts)
     low, high = (int(np.searchsorted(below, part * below[-1])) for part in _CENTRAL)
     spread = max((high - low) / _CENTRAL_SIGMAS, 0.5)

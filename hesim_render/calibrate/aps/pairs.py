@@ -22,9 +22,9 @@ from hesim_render.calibrate.aps.light_curve import (
     straight,
     through_origin,
 )
-from hesim_render.calibrate.aps.long_series import Long, long_series
+from hesim_render.calibrate.aps.long_series import Long, long_series, stuck_pixels
 from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
-from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, Levels, pair_levels
+from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, Levels, both_levels
 from hesim_render.calibrate.aps.spatial import Pattern, outliers, pattern_of
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance
 from hesim_render.calibrate.moments import Progress
@@ -127,6 +127,11 @@ class PairCalibration:
         """Signal at saturation, DN: of the largest variance, or the largest seen."""
         return float(self.signal[min(self.saturation, self.signal.size - 1)])
 
+    @property
+    def brightest_dn(self) -> float:
+        """Largest mean above black, DN: where a full well cuts off."""
+        return float(self.lit.mean.max()) - self.black.value
+
 
 def light_of(pairs: PairSet, levels: Levels) -> NDArray[np.float64]:
     """Photons per pixel of each level, or its exposure in s where photons are not stated."""
@@ -142,11 +147,11 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
         With file and line, if the captures are saturated, clipped at 0, or lit by light that drifts.
     """
     require_memory(_BYTES_PER_PIXEL * pairs.shape[0] * pairs.shape[1], "maps and transforms of a frame", pairs.file)
-    lit, dark = pair_levels(pairs, pairs.lit, progress), pair_levels(pairs, pairs.dark, progress)
+    lit, dark = both_levels(pairs, progress)
     signal, light = lit.mean - dark.mean, light_of(pairs, lit)
     saturation = _saturation(lit)
     pairs = pairs.with_long_at(_LONG_AT * float(light[min(saturation, light.size - 1)]))
-    long_dark, long_lit = (long_series(pairs, which, progress) for which in (False, True))
+    long_dark, long_lit = long_series(pairs, progress)
     _check_dark(pairs, dark, long_dark)
     _check_long(pairs, long_lit, lit, saturation)
     _check_mosaic(pairs, long_lit.mean - long_dark.mean)
@@ -170,8 +175,7 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
             "the variance does not rise with the light; no gain follows from these captures", file=pairs.file
         )
     responsivity = through_origin(light[use], signal[use], None)
-    rows, _ = pairs.shape
-    shared_error = np.sqrt((max(row[0], 0.0) + long_dark.temporal.pixel / pairs.shape[1]) / rows / 2)
+    shared_error = np.sqrt((max(row[0], 0.0) + long_dark.temporal.pixel / pairs.shape[1]) / pairs.shape[0] / 2)
     distinct = np.unique(dark.exposure_s, return_index=True)[1]
     black = straight(dark.exposure_s[distinct], dark.mean[distinct], np.full(distinct.size, max(shared_error, 1e-6)))
     noise = straight(dark.exposure_s[distinct], dark.variance[distinct], dark.error[distinct])
@@ -185,6 +189,7 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     relative, relative_noise = _relative(long_lit, long_dark, curve, light[clear])
     light_pattern = pattern_of(relative, relative_noise)
     defects = outliers(long_dark.mean, long_dark.spatial.noise) | outliers(relative, relative_noise)
+    defects |= np.any(stuck_pixels(pairs.spec.full_scale_dn, long_dark, long_lit), axis=0)
     return PairCalibration(
         pairs, lit, dark, signal, saturation, clear, gain, responsivity, black, noise, curve, fit, bins, level_chi2,
         level_chance, level_rms, row, col, linearity_error(light[clear], signal[clear], top), long_dark, long_lit,

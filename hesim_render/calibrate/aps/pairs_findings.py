@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2 as chi2_law
 
+from hesim_render.calibrate.aps.long_series import stuck_pixels
 from hesim_render.calibrate.aps.pairs import PairCalibration
 from hesim_render.calibrate.estimate import ALARM, Finding
 from hesim_render.recording.pair_set import light_of_series
@@ -69,6 +70,7 @@ def findings(result: PairCalibration) -> list[Finding]:
     level = _level_change(result)
     if level > _LEAST_LEVEL_DN:
         outcome.append(("black level", f"the dark level changes by {level:.2g} DN from exposure to exposure"))
+    outcome += _of_lag(result)
     outcome += _of_the_set(result)
     return [Finding(check, text, None) for check, text in outcome]
 
@@ -84,6 +86,23 @@ def _level_change(result: PairCalibration) -> float:
     if result.black.rms**2 < noise * chi2_law.isf(ALARM, freedom) / freedom:
         return 0.0
     return float(np.sqrt(result.black.rms**2 - noise))
+
+
+def _of_lag(result: PairCalibration) -> list[tuple[str, str]]:
+    """First frames in the dark that are brighter than the second: a sensor that keeps a part of the light before."""
+    change = result.dark.change[np.unique(result.dark.exposure_s, return_index=True)[1]]
+    if change.size < 3:
+        return []
+    mean, error = float(change.mean()), float(change.std(ddof=1)) / np.sqrt(change.size)
+    # without normal errors: that all of many pairs have one sign is as rare
+    alike = 2.0 ** (1 - change.size) < ALARM and bool(np.all(change > 0))
+    if mean < 5 * _LEAST_LEVEL_DN or not (alike or mean > SIGNIFICANT * error):
+        return []
+    text = (
+        f"the first dark frame of a pair is {mean:.2g} DN brighter than the second, as after light that leaves a part "
+        "behind (image lag) or while the black level settles: discard a few frames before each series"
+    )
+    return [("image lag", text)]
 
 
 def _of_the_long_series(result: PairCalibration) -> list[tuple[str, str]]:
@@ -113,6 +132,10 @@ def _of_the_set(result: PairCalibration) -> list[tuple[str, str]]:
     """What the captures are made of."""
     pairs = result.pairs
     outcome = []
+    white, black = (int(p.sum()) for p in stuck_pixels(pairs.spec.full_scale_dn, result.long_dark, result.long_lit))
+    if white + black:
+        text = f"{white} pixels are at full scale in the dark, {black} at 0 DN in the light; they count as defects"
+        outcome.append(("stuck pixels", text))
     if result.dark_noise_is_rounded_off:
         text = (
             f"the dark variance is down to {result.dark.variance.min():.3f} DN², below the 0.24 of EMVA 1288: rounding "

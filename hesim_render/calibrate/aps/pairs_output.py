@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from hesim_render.calibrate.aps.long_series import Long
+from hesim_render.calibrate.aps.long_series import Long, stuck_pixels
+from hesim_render.calibrate.aps.pair_levels import WELL_SHARE
 from hesim_render.calibrate.aps.pairs import DARK_NOISE_LIMIT_DN, PairCalibration, evaluate
 from hesim_render.calibrate.aps.pairs_findings import SIGNIFICANT, findings
 from hesim_render.calibrate.aps.variance import TERMS
@@ -206,14 +207,14 @@ def _full_well(result: PairCalibration, k: float, relative: float) -> dict[str, 
     last = here + int(np.argmin(np.append(near[here:], False))) - 1
     per_photon = result.responsivity.slope / k
     ends = per_photon * np.array([light[here - 1], light[min(last + 1, light.size - 1)]])
-    adc = result.lit.high[here:].max() > 0.01
+    adc = result.lit.high[here:].max() > WELL_SHARE
     # the brightest level may be cut off as a whole: its mean is then the end itself
     most = result.pairs.spec.full_scale_dn - result.black.value if adc else result.signal.max()
     ends[1] = max(ends[1], most / k)
     low, high = ends * (1 + Z_95 * relative * np.array([-1, 1]))
     return estimated(float(electrons), float(high - low) / (2 * Z_95), "e-") | {
         "interval_95": [float(low), float(high)], "limited_by": "ADC full scale" if adc else "full well",
-        "photons": float(light[here]),
+        "photons": float(light[here]), **({} if adc else {"cut_off_e": result.brightest_dn / k}),
     }  # fmt: skip
 
 
@@ -268,6 +269,14 @@ def maps(result: PairCalibration) -> dict[str, NDArray]:
     shape = result.pairs.shape
     shading = result.light_pattern.shading()
     step = max(1, -(-max(shape) // _FIGURE_PX))
+    offset = result.dark_pattern.col + result.dark_pattern.pixel
+    response = np.maximum((1 + result.light_pattern.whole) / (1 + shading), 0.0)
+    full = result.pairs.spec.full_scale_dn
+    # beyond the range, so that no noise leads out of its ends
+    white, black = stuck_pixels(full, result.long_dark, result.long_lit)
+    offset[white] += full
+    offset[black] -= full
+    response[black] = 0.0
     lit, dark = result.lit, result.dark
     points = [
         (0, 0, t, is_lit, x, v - ADC_VARIANCE_DN2 - result.lines_dn2, shape[0] * shape[1])
@@ -279,9 +288,9 @@ def maps(result: PairCalibration) -> dict[str, NDArray]:
     ]  # fmt: skip
     return {
         "n_row": result.dark_pattern.row,
-        "n_blc": (result.dark_pattern.col + result.dark_pattern.pixel).astype(np.float32),
+        "n_blc": offset.astype(np.float32),
         "n_dp": np.full(shape, max(result.black.slope, 0.0), np.float32),
-        "response": (1 + result.light_pattern.whole - shading).astype(np.float32),
+        "response": response.astype(np.float32),
         "light_rel": (1 + shading).astype(np.float32),
         "bad_pixels": result.defects,
         "figure_variance_map": result.long_lit.variance[::step, ::step],

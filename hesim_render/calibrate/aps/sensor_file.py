@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from hesim_render.calibrate.aps.pair_levels import WELL_SHARE
 from hesim_render.calibrate.aps.pairs import PairCalibration
 from hesim_render.core.output import output_errors, replacing
 
@@ -68,8 +69,8 @@ def write_sensor(file: str | Path, calibration: str | Path, result: PairCalibrat
     """
     path = Path(file)
     k, spec = result.gain.slope, result.pairs.spec
-    limited = bool(result.saturation < result.signal.size and result.lit.high[result.saturation :].max() <= 0.01)
-    well = result.top_dn / k if limited else 1.25 * spec.full_scale_dn / k
+    limited = bool(result.saturation < result.signal.size and result.lit.high[result.saturation :].max() <= WELL_SHARE)
+    well = result.brightest_dn / k if limited else 1.25 * spec.full_scale_dn / k
     has_photons = result.pairs.has_photons
     exposure_us = max(1, round(1e6 * result.pairs.spatial_lit.exposure_s))
     text = _TEXT.format(

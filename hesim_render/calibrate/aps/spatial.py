@@ -187,22 +187,46 @@ def pattern_of(
     expected : the pattern that is expected, whose errors are smallest and whose variance is smaller than the pattern's.
     """
     power_law = 1.0 if expected else 0.5
-    level = float(image.mean())
-    by_row, by_col = image.mean(axis=1) - level, image.mean(axis=0) - level
-    rest = image - level - by_row[:, None] - by_col
-    spread = 1.4826 * float(np.median(np.abs(rest)))
-    # single pixels that stand out would ring in a transform
-    plain = np.clip(rest, -_INDIVIDUAL * spread, _INDIVIDUAL * spread)
+    level, individual = _individuals(image)
+    by_row, by_col = (image - individual).mean(axis=1) - level, (image - individual).mean(axis=0) - level
+    plain = image - individual - level - by_row[:, None] - by_col
     waves = _waves(plain, noise[2], spectrum, frames, power_law)
-    rest = rest - waves
     smooth = uniform_filter(plain - waves, _BOX, mode="nearest")
     part = 1 / _BOX**2
     # what is left of the noise when a box mean was taken out
-    fine = _scaled(rest - smooth, noise[2] * (1 - part), power_law)
+    fine = _scaled(plain - waves - smooth, noise[2] * (1 - part), power_law)
+    fine += individual * _true_part(individual**2, noise[2]) ** power_law - individual.mean()
     power = float(np.mean(smooth**2))
     smooth *= _true_part(power, noise[2] * part) ** power_law
     profiles = _profile(by_row, noise[0], power_law), _profile(by_col, noise[1], power_law)
     return Pattern(*profiles, waves + smooth + fine)
+
+
+def _individuals(image: NDArray) -> tuple[float, NDArray[np.float64]]:
+    """Mean of an image without the pixels that stand out, and how far these do; 0 elsewhere.
+
+    Such pixels would ring in a transform, and be in the means of their rows and columns, where they are not at home.
+    """
+    own, spread = _without_profiles(image)
+    own[np.abs(own) <= _INDIVIDUAL * spread] = 0.0
+    return float((image - own).mean()), own
+
+
+def _without_profiles(image: NDArray) -> tuple[NDArray[np.float64], float]:
+    """An image less the means of its rows and columns, to which pixels that stand out do not add, and its spread."""
+    rest = image - np.median(image, axis=1)[:, None]
+    rest -= np.median(rest, axis=0)
+    for _ in range(3):
+        spread = 1.4826 * float(np.median(np.abs(rest)))
+        good = np.abs(rest) <= _INDIVIDUAL * spread
+        rest = rest - _mean_of(rest, good, 1)[:, None]
+        rest -= _mean_of(rest, good, 0)
+    return rest, spread
+
+
+def _mean_of(values: NDArray, good: NDArray[np.bool_], axis: int) -> NDArray[np.float64]:
+    """Means of the good pixels along an axis; 0 where none is good."""
+    return np.asarray(np.sum(np.where(good, values, 0.0), axis=axis) / np.maximum(good.sum(axis=axis), 1))
 
 
 def _true_part(power: NDArray | float, noise: NDArray | float) -> NDArray[np.float64]:
@@ -251,7 +275,7 @@ def _profile(values: NDArray, noise: float, law: float = 0.5) -> NDArray[np.floa
 
 def outliers(image: NDArray, noise: tuple[float, float, float], sigmas: float = 8.0) -> NDArray[np.bool_]:
     """Pixels [row, col] that lie so many robust standard deviations from the pixels around them."""
-    rest = image - image.mean(axis=1, keepdims=True) - image.mean(axis=0) + image.mean()
-    spread = max(1.4826 * float(np.median(np.abs(rest))), float(np.sqrt(max(noise[2], 0.0))), 1e-12)
+    rest, spread = _without_profiles(image)
+    spread = max(spread, float(np.sqrt(max(noise[2], 0.0))), 1e-12)
     rest -= uniform_filter(np.clip(rest, -_INDIVIDUAL * spread, _INDIVIDUAL * spread), _BOX, mode="nearest")
     return np.abs(rest) > sigmas * spread
