@@ -114,7 +114,7 @@ def twin_of_sensor(folder, name, seed, lacking=()):
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == "CMOS" else pytest.mark.slow) for n in SENSORS])
 def test_twins_of_unlike_sensors_pass(tmp_path, name):
     """Three pairs are lacking. A drift of the light is named."""
-    twin = twin_of_sensor(tmp_path, name, 4, lacking=(5, 6, 14))
+    twin = twin_of_sensor(tmp_path, name, 5, lacking=(5, 6, 14))
     assert twin.passed, [(c.name, c.worst, c.rms) for c in twin.checks if not c.passed]
     named = {finding.check for finding in twin.findings}
     assert ("light of the long series" in named) == (name == "light that drifts")
