@@ -26,6 +26,7 @@ __all__ = [
 ]  # fmt: skip
 
 _LATEST_US = 2**53  # 285 years
+_LAST_PX = 2**16 - 1
 _BYTES_IN_ALL = EVENT_DTYPE.itemsize + 12  # an event, and its columns while they are read
 
 
@@ -93,8 +94,8 @@ def stream_events(path: Path, count: int | None = None) -> Iterator[NDArray]:
         If the file cannot be read, links to other files, or its parts do not fit each other.
     """
     with reading(path, "as events"), h5py.File(path, "r") as file:
-        columns, total = _columns(file, path, count)
-        offset = _offset(file, path)
+        columns, total = _columns(file, path, count, any_integers=True)
+        offset = _offset(file, path) if "t_offset" in file else 0
         for first in range(0, total, BLOCK):
             events = _block(columns, first, min(first + BLOCK, total), None, path)
             events["t_us"] += offset
@@ -118,9 +119,12 @@ def read_shape(path: Path) -> tuple[int, int] | None:
     return rows, cols
 
 
-def _columns(file: Any, path: Path, count: int | None) -> tuple[dict[str, Any], int]:
-    """The data sets of the events, and the number of events."""
-    columns = {name: _column(file, f"events/{name}", path, kind) for name, kind in COLUMNS.items()}
+def _columns(file: Any, path: Path, count: int | None, any_integers: bool = False) -> tuple[dict[str, Any], int]:
+    """The data sets of the events, and the number of events; other programs write integers of other sizes."""
+    columns = {
+        name: _column(file, f"events/{name}", path, np.uint64 if any_integers else kind, any_integers)
+        for name, kind in COLUMNS.items()
+    }
     sizes = {name: column.shape[0] for name, column in columns.items()}
     if len(set(sizes.values())) > 1:
         lengths = ", ".join(f"{name} {size}" for name, size in sizes.items())
@@ -134,23 +138,30 @@ def _columns(file: Any, path: Path, count: int | None) -> tuple[dict[str, Any], 
 def _block(columns: Any, first: int, last: int, shape: tuple[int, int] | None, path: Path) -> NDArray:
     """Events first to last (not included), with times relative to ``t_offset``."""
     events = np.empty(last - first, dtype=EVENT_DTYPE)
-    events["t_us"] = columns["t"][first:last]
+    events["t_us"] = _in_range(columns["t"][first:last], "t", _LATEST_US, path)
     for name in ("x", "y"):
-        values = columns[name][first:last]
+        values = _in_range(columns[name][first:last], name, _LAST_PX, path)
         if shape is not None and values.max() >= shape[name == "x"]:
             raise SpecError(f"events/{name} holds {values.max()}, outside the event grid", file=path)
         events[name] = values
     polarity = columns["p"][first:last]
-    if polarity.max() > 1:
-        raise SpecError(f"events/p holds {polarity.max()}; expected 0 and 1", file=path)
+    if polarity.min() < 0 or polarity.max() > 1:
+        raise SpecError(f"events/p holds {polarity.min()} to {polarity.max()}; expected 0 and 1", file=path)
     events["polarity"] = polarity.astype(np.int8) * 2 - 1
     return events
 
 
-def _column(file: Any, name: str, path: Path, kind: Any = np.uint64) -> Any:
+def _in_range(values: NDArray, name: str, last: int, path: Path) -> NDArray:
+    """Values that are no smaller than 0 and no larger than the last one."""
+    if values.min() < 0 or values.max() > last:
+        raise SpecError(f"events/{name} holds {values.min()} to {values.max()}; expected 0 to {last}", file=path)
+    return values
+
+
+def _column(file: Any, name: str, path: Path, kind: Any = np.uint64, signed: bool = False) -> Any:
     """A one-dimensional data set whose values are all stored, without fill values."""
-    column = dataset_of(file, name, path)
-    if column.dtype.kind != "u" or column.dtype.itemsize > np.dtype(kind).itemsize:
+    column = dataset_of(file, name, path, "uib" if signed else "ui")
+    if column.dtype.kind not in ("uib" if signed else "u") or column.dtype.itemsize > np.dtype(kind).itemsize:
         raise SpecError(f"{name} holds {column.dtype.name}; expected {np.dtype(kind).name}", file=path)
     if column.ndim != 1:
         raise SpecError(f"{name} has shape {column.shape}; expected one dimension", file=path)

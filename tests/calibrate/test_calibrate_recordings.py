@@ -231,6 +231,54 @@ def test_hot_and_silent_pixels():
     assert "two recordings" in still.hot_share(parts[:1])["reason"]
 
 
+def test_hot_pixels_are_in_no_rate_and_no_leak():
+    """Five pixels of 300 Hz would treble the mean of pixels of 1.2 Hz; in one recording nothing tells them."""
+    rng = np.random.default_rng(12)
+    events = []
+    for hz in (1.2, 1.5):
+        on = np.full(PIXELS, hz)
+        on[[3, 40, 41, 200, 590]] = 300.0
+        events.append(random_events(rng, on, 0.0, seconds=20.0, shape=SHAPE))
+        events[-1]["polarity"] = 1
+    several = [tally(EventStream.of(one, SHAPE)) for one in events]
+    found = calibration.figures(several, None, (1.0, 31.0), None, None)
+    assert found["hot_share"]["note"] == f"5 of {PIXELS} pixels"
+    for entry, hz in zip(found["recordings"], (1.2, 1.5), strict=True):
+        assert abs(entry["on_rate_hz"]["value"] - hz) < 4.5 * entry["on_rate_hz"]["standard_error"] < 0.1
+        assert entry["leak_rate_hz"]["value"] == pytest.approx(hz, abs=0.05)
+        assert entry["on_rate_spread_rel"]["value"] == 0 and entry["on_rate_spread_rel"]["upper_limit"] < 0.1
+        assert entry["on_local_variation"]["value"] == pytest.approx(1, abs=0.03)
+    assert found["leak_growth_hz_per_lux"]["value"] == pytest.approx(0.01, abs=0.002)
+    alone = calibration.figures([tally(EventStream.of(events[0], SHAPE))], None, None, None, None)
+    assert alone["recordings"][0]["on_rate_hz"]["value"] > 3
+
+
+@pytest.mark.parametrize(("hz", "part"), [(100.0, 0.3), (120.04, 0.3), (100.0, 0.05), (90.0, 0.6)])
+def test_a_lamp_of_alternating_current_is_named(hz, part):
+    """A part of the ON events comes within a tenth of a period; other frequencies, and a few, are not lamps."""
+    rng = np.random.default_rng(13)
+    events = random_events(rng, np.full(PIXELS, 6.0), 4.0, seconds=10.0, shape=SHAPE)
+    chosen = (events["polarity"] > 0) & (rng.random(events.size) < part)
+    phase = np.floor(events["t_us"][chosen] * 1e-6 * hz) + 0.1 * rng.random(np.count_nonzero(chosen))
+    events["t_us"][chosen] = phase / hz * 1e6
+    events = events[np.argsort(events["t_us"], kind="stable")]
+    found = calibration.figures([tally(EventStream.of(events, SHAPE))], None, None, None, None)
+    is_lamp = part == 0.3
+    assert len(found["findings"]) == is_lamp
+    if is_lamp:
+        assert f"a lamp of {round(hz)} Hz" in found["findings"][0]["text"]
+        assert "lamp flickers" in found["dead_time_us"]["reason"]
+
+
+def test_windows_of_a_lamp_that_flickers_are_no_readout_limit():
+    """20,000 events in each of 30 ms, but for chance: 0.7 %, of which a read-out at its limit has nothing."""
+    rng = np.random.default_rng(14)
+    for spread, is_limited in ((np.sqrt(20_000), False), (3.0, True)):
+        windows = np.bincount(np.maximum(np.rint(20_000 + spread * rng.standard_normal(60)), 0).astype(np.int64))
+        one = SimpleNamespace(windows=windows, pixels=307_200)
+        assert (readout_limit([one])[0]["value"] is not None) is is_limited
+
+
 def test_what_is_not_identifiable_says_why(tmp_path):
     _, events, moving = sensor(8)
     names = files(events, moving, tmp_path)

@@ -33,7 +33,8 @@ def test_a_tally_is_what_a_loop_over_events_counts():
     assert found.seconds == pytest.approx(SECONDS) and found.pixels == PIXELS
     counts, slices = np.zeros((2, 2, PIXELS)), np.zeros((2, SLICES, GROUPS))
     intervals, windows = np.zeros(LONG_US + 1), np.zeros(61)
-    variation, pairs, turns = np.zeros(GROUPS), np.zeros(GROUPS), []
+    variation, pairs, turns = np.zeros(PIXELS), np.zeros(PIXELS), []
+    waves = np.zeros((2, SLICES), complex)
     last, last_on, was_on, turned = {}, {}, {}, {}
     group = found.group.astype(int)
     for t, x, y, polarity in events[["t_us", "x", "y", "polarity"]].tolist():
@@ -49,11 +50,12 @@ def test_a_tally_is_what_a_loop_over_events_counts():
                 turned[pixel] = t
         last[pixel], was_on[pixel] = t, polarity > 0
         if polarity > 0:
+            waves[:, min(int(SLICES * part), SLICES - 1)] += np.exp(2j * np.pi * np.array([1e-4, 1.2e-4]) * (t - 700))
             before = last_on.get(pixel, [])
             if len(before) == 2 and before[1] > before[0] and t > before[1]:
                 a, b = t - before[1], before[1] - before[0]
-                variation[group[pixel]] += 3 * ((a - b) / (a + b)) ** 2
-                pairs[group[pixel]] += 1
+                variation[pixel] += 3 * ((a - b) / (a + b)) ** 2
+                pairs[pixel] += 1
             last_on[pixel] = [*before, t][-2:]
     np.testing.assert_array_equal(found.counts, counts)
     np.testing.assert_array_equal(found.slices, slices)
@@ -61,6 +63,7 @@ def test_a_tally_is_what_a_loop_over_events_counts():
     np.testing.assert_array_equal(found.windows[1:], np.bincount(windows.astype(int))[1:])
     np.testing.assert_array_equal(found.pairs, pairs)
     np.testing.assert_allclose(found.variation, variation)
+    np.testing.assert_allclose(found.waves, waves)
     every = np.array(turns)
     near = every[np.abs(every / np.median(every) - 1) < 0.3]
     assert found.period_s() == pytest.approx(near.mean() * 1e-6)
@@ -71,10 +74,9 @@ def test_rates_spread_and_regularity_have_the_errors_of_leaving_groups_out():
     rng = np.random.default_rng(2)
     one = tally(EventStream.of(events_of(rng), SHAPE))
     one.counts[:] = rng.poisson(rng.uniform(20, 80, PIXELS), (2, 2, PIXELS))
-    one.slices[:] = rng.integers(1, 30, one.slices.shape)
     group = one.group.astype(int)
     rates = still.group_rates(one)
-    of_group = one.slices.sum(axis=1)
+    of_group = np.array([np.bincount(group, count, GROUPS) for count in one.counts.sum(axis=1)])
     assert rates[:, 0] == pytest.approx(of_group.sum(axis=1) / (PIXELS * SECONDS))
     for k in range(GROUPS):
         left = PIXELS - np.sum(group == k)
@@ -96,15 +98,19 @@ def test_rates_spread_and_regularity_have_the_errors_of_leaving_groups_out():
     assert whole > 2 * error
     assert told["value"] == pytest.approx(np.sqrt(whole))
     assert told["standard_error"] == pytest.approx(error / (2 * np.sqrt(whole)))
-    one.variation, one.pairs = rng.uniform(3, 9, GROUPS), rng.integers(8, 14, GROUPS)
+    one.variation, one.pairs = rng.uniform(3, 9, PIXELS), rng.integers(5, 9, PIXELS)
     total, count = one.variation.sum(), one.pairs.sum()
-    parts = (total - one.variation) / (count - one.pairs)
+    parts = np.array([one.variation[group != k].sum() / one.pairs[group != k].sum() for k in range(GROUPS)])
     told = still.regularity(one)
     assert told["value"] == pytest.approx(total / count)
     assert told["standard_error"] == pytest.approx(np.sqrt(19 / 20 * np.sum((parts - parts.mean()) ** 2)))
-    one.pairs = np.full(GROUPS, 10)
+    one.pairs = np.full(PIXELS, 5)
     assert still.regularity(one)["value"] is not None
-    one.pairs[3] = 9
+    one.used[7] = False  # a hot pixel takes no part in any of them
+    first[7] = 1e6
+    assert still.rate_spread(one, 1)["value"] < 1 and still.group_rates(one)[1, 0] < 1e5
+    assert "195 pairs" in still.regularity(one)["reason"]
+    one.used[7], one.pairs[3] = True, 4
     assert "199 pairs" in still.regularity(one)["reason"]
 
 
@@ -122,7 +128,7 @@ def slices_tally(per_slice):
     """Counts of 20 slices of a recording of 40 pixels and 2 s."""
     slices = np.zeros((2, SLICES, GROUPS))
     slices[0, :, 3], slices[1, :, 5] = np.asarray(per_slice) * 0.75, np.asarray(per_slice) * 0.25
-    return SimpleNamespace(slices=slices, pixels=PIXELS, seconds=2.0)
+    return SimpleNamespace(slices=slices, pixels=PIXELS, seconds=2.0, waves=np.zeros((2, SLICES)))
 
 
 def test_a_scene_is_not_still_beyond_half_of_its_rate_or_a_burst():
@@ -142,6 +148,16 @@ def test_a_scene_is_not_still_beyond_half_of_its_rate_or_a_burst():
         high = next(c for c in range(400, 4000, 4) if c > stats.poisson.isf(1e-3 / 20, 3 * (19 * 400 + c) / 20))
         burst[9] = 4 * round(factor * high / 4)
         assert (still.not_still(slices_tally(burst)) is not None) is is_told
+
+
+def test_on_events_of_one_phase_are_those_of_a_lamp():
+    """The sum of phases over the number is 0.1 or more, and its square over the number four times that of chance."""
+    for depth, each, is_seen in ((0.099, 4000, False), (0.101, 4000, True), (0.2, 70, False), (0.2, 80, True)):
+        one = slices_tally(np.full(20, each / 0.75))
+        one.waves = np.zeros((2, SLICES), complex)
+        one.waves[1] = np.sqrt(depth**2 * each**2 + each) * np.exp(1j * np.arange(SLICES))
+        assert (still.not_still(one) is not None) is is_seen, (depth, each)
+    assert "a lamp of 120 Hz (the sum of their phases is 20 % of" in still.of_a_lamp(one)
 
 
 def rates_of(rng, lux, ratio, dark, growth, scatter=0.0):
@@ -198,24 +214,25 @@ def test_a_target_tells_each_pixels_ratio_and_so_its_leak():
     ratio = rng.uniform(0.8, 1.5, PIXELS)
     off = rng.integers(40, 90, PIXELS).astype(float)
     moving = SimpleNamespace(
-        per_pixel=lambda: np.stack([ratio * off + 3.0 * 4.0, off]), seconds=4.0, group=group.astype(np.uint64)
-    )
+        per_pixel=lambda: np.stack([ratio * off + 3.0 * 4.0, off]), seconds=4.0, group=group.astype(np.uint64),
+        used=np.ones(PIXELS, bool),
+    )  # fmt: skip
     tallies = []
     for leak, quiet in ((0.7, 30.0), (1.9, 11.0)):
         count = quiet * rng.uniform(0.5, 1.5, PIXELS)
         both = np.stack([ratio * count + leak * 2.5, count])
-        slices = np.zeros((2, SLICES, GROUPS))
-        for polarity in (0, 1):
-            slices[polarity, 0] = np.bincount(group, both[polarity], GROUPS)
         tallies.append(
-            SimpleNamespace(per_pixel=lambda both=both: both, seconds=2.5, slices=slices, pixels=PIXELS, group=group)
-        )
+            SimpleNamespace(
+                per_pixel=lambda both=both: both, seconds=2.5, pixels=PIXELS, group=group,
+                by_group=lambda values: np.bincount(group, values, GROUPS),
+            )
+        )  # fmt: skip
     found = still.balance_with_target(tallies, [5.0, 80.0], moving, {"value": 1.1}, 3.0)
     assert found.ratio == {"value": 1.1}
     assert [leak["value"] for leak in found.leaks] == pytest.approx([0.7, 1.9])
     # a tenth of the target's leak is not known: each pixel's ratio is off by 0.1 · 3 · 4 over its OFF events
     for leak, one in zip(found.leaks, tallies, strict=True):
-        unsure = 0.1 * 12 * np.mean(1 / off) * one.slices[1].sum() / (PIXELS * 2.5)
+        unsure = 0.1 * 12 * np.mean(1 / off) * one.per_pixel()[1].sum() / (PIXELS * 2.5)
         assert leak["standard_error"] == pytest.approx(unsure)
     assert found.dark["value"] == pytest.approx(0.7 - 1.2 * 5 / 75)
     assert found.growth["value"] == pytest.approx(1.2 / 75)

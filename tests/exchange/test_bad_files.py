@@ -15,7 +15,7 @@ from event_files import DATA, SHAPE, columns, made, many, raw, written
 import hesim_render as hr
 from hesim_render.cli import main
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
-from hesim_render.exchange import EVENT_FORMATS, EventStream, aedat4, open_events, raw_file
+from hesim_render.exchange import EVENT_FORMATS, EventStream, aedat4, dsec, open_events, raw_file
 from hesim_render.exchange.dsec_writer import EventFileWriter
 from hesim_render.recording.exports import SUFFIXES, import_events
 
@@ -186,8 +186,29 @@ def test_the_index_of_milliseconds_counts_from_the_begin_and_goes_to_the_end(tmp
         columns_ = file["events/x"][:].astype("<i2")
         del file["events/x"]
         file["events/x"] = columns_
+    # other programs write integers of other sizes, and no index of milliseconds
+    assert read_all(tmp_path / "e.h5", None, (3, 5)) == 4
     with pytest.raises(SpecError, match="events/x holds int16; expected uint16"):
-        read_all(tmp_path / "e.h5", None, (3, 5))
+        dsec.read_events(tmp_path / "e.h5")
+    with h5py.File(tmp_path / "e.h5", "r+") as file:
+        for name, kind in (("t", "<i8"), ("y", "<u4"), ("p", "?")):
+            values = file[f"events/{name}"][:].astype(kind)
+            del file[f"events/{name}"]
+            file[f"events/{name}"] = values
+        del file["ms_to_idx"], file["t_offset"]
+    (block,) = open_events(tmp_path / "e.h5", None, (3, 5))
+    assert block["t_us"].tolist() == [200, 1000, 1001, 4003]
+    for name, value, expected in (("y", 1 << 20, "0 to 65535"), ("x", -1, "0 to 65535"), ("t", -5, "0 to 9007")):
+        with h5py.File(tmp_path / "e.h5", "r+") as file:
+            before = file[f"events/{name}"][2]
+            file[f"events/{name}"][2] = value
+        with pytest.raises(SpecError, match=rf"events/{name} holds .*; expected {expected}"):
+            read_all(tmp_path / "e.h5", None, (3, 5))
+        with h5py.File(tmp_path / "e.h5", "r+") as file:
+            file[f"events/{name}"][2] = before
+    with h5py.File(tmp_path / "e.h5", "r+") as file:
+        file["t_offset"] = 700
+        file["ms_to_idx"] = np.array([0, 1, 3, 3, 3, 4, 4, 4], "<u8")
     with h5py.File(tmp_path / "e.h5", "r+") as file:
         del file["events/x"]
         file.create_dataset("events/x", data=columns_.astype("<u2"), chunks=(1 << 26,), maxshape=(None,))

@@ -113,6 +113,10 @@ def figures(
             "time; expected a recording of all events: less light, a smaller part of the sensor, or less contrast",
             file=one.source,
         )
+    if len(tallies) > 1:
+        hot = still.hot_pixels(tallies)
+        for one in every:
+            one.used &= ~hot
     of_target = target.unknown("it takes a recording of a moving target (--target)")
     result = still.balance(tallies, lux)
     if moving is not None and contrast is not None:
@@ -147,10 +151,13 @@ def _dead_time(tallies: Sequence[EventTally], moving: EventTally | None) -> dict
     """Dead time from the still scenes, whose noise comes at any time. A target that moves has a shortest time between
     two events of its own, which the dead time does not exceed.
     """
-    own = dead_time(tallies)
+    steady = [one for one in tallies if still.of_a_lamp(one) is None]
+    if not steady:
+        return not_identifiable("the lamp flickers in every recording, which gives the intervals steps of its own")
+    own = dead_time(steady)
     if own["value"] is not None or moving is None:
         return own
-    most = dead_time([*tallies, moving])
+    most = dead_time([*steady, moving])
     if most["value"] is None:
         return own
     return not_identifiable(

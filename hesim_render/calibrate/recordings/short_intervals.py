@@ -19,8 +19,9 @@ _LEAST_INTERVALS = 100
 _STRAY = 0.03
 #: Windows that must be equally full, and part of all windows of the same recording above which it is saturated.
 _LEAST_WINDOWS, _SATURATED = 20, 0.1
-#: Fullest windows differ by no more than this part.
-_SAME = 0.01
+#: Fullest windows differ by no more than this part, and than this part of what chance makes of as many events: those
+#: of a lamp that flickers are as full as one another, but for chance.
+_SAME, _OF_CHANCE = 0.01, 0.5
 #: Windows are full of pixels if they hold so many events of each, but for this part of the pixels.
 _SILENT = 0.02
 
@@ -90,7 +91,7 @@ def readout_limit(tallies: Sequence[EventTally]) -> tuple[dict[str, Any], list[E
     pixels or the light are the limit. The interval is half of that, at least one event a window.
     """
     most = max(one.windows.size - 1 for one in tallies)
-    slack = max(2, round(_SAME * most))
+    slack = max(2, round(min(_SAME * most, _OF_CHANCE * np.sqrt(most))))
     windows = [np.pad(one.windows, (0, most + 1 - one.windows.size)) for one in tallies]
     every = np.sum(windows, axis=0)
     full, below = every[most - slack :], every[max(most - 2 * slack - 1, 0) : most - slack]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hesim_render.calibrate.estimate import estimated, not_identifiable
-from hesim_render.calibrate.recordings.tally import GROUPS, SLICES, EventTally
+from hesim_render.calibrate.recordings.tally import GROUPS, LAMPS_HZ, SLICES, EventTally
 
 #: Events of a pixel, as the median, with which a silent pixel is not silent by chance.
 _EVENTS_TO_BE_SILENT = 30
@@ -25,6 +25,10 @@ _EVENTS_TO_BE_SILENT = 30
 _HOT, _HOT_CHANCE = 10.0, 1e-3
 #: Chance of a slice of three times the mean rate that counts as one of such a rate.
 _BURST_CHANCE = 1e-3
+#: Part of the ON events that have one phase of a lamp, and their power over that of chance, from which it flickers.
+_LEAST_FLICKER, _FLICKER_POWER = 0.1, 4.0
+#: Periods of a lamp in a slice of a recording that tells it.
+_LEAST_PERIODS = 2.0
 #: Relative standard deviation of thresholds over pixels, where none was measured.
 USUAL_MISMATCH = 0.1
 #: Shift of ρ, and of a leak over ρ n₋, in squares of the mismatch.
@@ -39,10 +43,10 @@ _LEAST_PAIRS = 200
 
 def group_rates(tally: EventTally) -> NDArray[np.float64]:
     """Events per pixel and second [polarity, k]: of all pixels, and without each group of pixels."""
-    events = tally.slices.sum(axis=1).astype(np.float64)
-    pixels = np.bincount(tally.group.astype(np.int64), minlength=GROUPS)
+    events = np.array([tally.by_group(count) for count in tally.per_pixel()])
+    pixels = tally.by_group(np.ones(tally.pixels))
     every = np.concatenate([events.sum(axis=1, keepdims=True), events.sum(axis=1, keepdims=True) - events], axis=1)
-    return every / (np.append(tally.pixels, tally.pixels - pixels) * tally.seconds)
+    return every / (np.append(pixels.sum(), pixels.sum() - pixels) * tally.seconds)
 
 
 def jackknife(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -63,11 +67,10 @@ def rate_spread(tally: EventTally, polarity: int) -> dict[str, Any]:
     counting of events has no part. The error is that of a jackknife over groups of pixels.
     """
     halves = tally.counts[polarity].astype(np.float64)
-    if halves.sum() < 2 * _EVENTS_TO_BE_SILENT:
-        return not_identifiable(f"{int(halves.sum())} events in all")
-    group = tally.group.astype(np.int64)
+    if halves[:, tally.used].sum() < 2 * _EVENTS_TO_BE_SILENT:
+        return not_identifiable(f"{int(halves[:, tally.used].sum())} events in all")
     # sums of each group of pixels: number, counts of both halves, and their product, [4, group]
-    sums = np.array([np.bincount(group, v, GROUPS) for v in (np.ones(tally.pixels), *halves, halves[0] * halves[1])])
+    sums = np.array([tally.by_group(v) for v in (np.ones(tally.pixels), *halves, halves[0] * halves[1])])
 
     def relative(s: NDArray[np.float64]) -> NDArray[np.float64]:
         means = s[1:] / s[0]
@@ -85,12 +88,13 @@ def rate_spread(tally: EventTally, polarity: int) -> dict[str, Any]:
 
 def regularity(tally: EventTally) -> dict[str, Any]:
     """Local variation of a pixel's ON intervals [shinomoto2003]: 1 for a Poisson process, 0 for equal intervals."""
-    pairs = int(tally.pairs.sum())
+    of_groups, variation = tally.by_group(tally.pairs), tally.by_group(tally.variation)
+    pairs = int(of_groups.sum())
     if pairs < _LEAST_PAIRS:
         return not_identifiable(f"{pairs} pairs of successive ON intervals; {_LEAST_PAIRS} are needed")
     # mean over pairs of intervals, then the same without each group
-    whole = tally.variation.sum() / pairs
-    parts = (tally.variation.sum() - tally.variation) / np.maximum(pairs - tally.pairs, 1)
+    whole = variation.sum() / pairs
+    parts = (variation.sum() - variation) / np.maximum(pairs - of_groups, 1)
     error = float(jackknife(np.append(whole, parts)))
     return estimated(whole, error, "", GROUPS)
 
@@ -165,7 +169,7 @@ def balance_with_target(
     """
     on, off = moving.per_pixel().astype(np.float64)
     # pixels that the target passed over
-    seen = off > 0.25 * np.median(off[off > 0])
+    seen = (off > 0.25 * np.median(off[off > 0])) & moving.used
     # each pixel's ratio θ₋/θ₊: its levels are balanced over the recording
     own = np.where(seen, (on - leak_hz * moving.seconds) / np.maximum(off, 1.0), 0.0)
     group = moving.group.astype(np.int64)
@@ -304,4 +308,27 @@ def not_still(tally: EventTally) -> str | None:
             f"its rate goes from {early:.4g} to {late:.4g} Hz a pixel, at most {each.max():.4g}: the scene moves, the "
             "lamp flickers, or the camera was not settled"
         )
-    return None
+    return of_a_lamp(tally)
+
+
+def of_a_lamp(tally: EventTally) -> str | None:
+    """A line that says that the ON events follow alternating current; None where chance makes as much of it.
+
+    Of independent events at any time, the squared length of their sum of phases over their number has mean 1.
+    """
+    on = tally.slices[0].sum(axis=1).astype(np.float64)
+    if on.min() == 0 or tally.seconds / SLICES < _LEAST_PERIODS / min(LAMPS_HZ):
+        return None
+    # a slice that is no whole number of periods has a sum of its own
+    turns = np.outer(LAMPS_HZ, np.linspace(0.0, tally.seconds, SLICES + 1))
+    even = np.diff(np.exp(2j * np.pi * turns), axis=1) / (2j * np.pi * np.diff(turns, axis=1))
+    squares = np.abs(tally.waves - on * even) ** 2
+    depth = np.sqrt(np.maximum(np.mean((squares - on) / on**2, axis=1), 0.0))
+    power = np.mean(squares / on, axis=1)
+    k = int(np.argmax(depth))
+    if depth[k] < _LEAST_FLICKER or power[k] < _FLICKER_POWER:
+        return None
+    return (
+        f"its ON events come with a lamp of {LAMPS_HZ[k]:g} Hz (the sum of their phases is {100 * depth[k]:.2g} % of "
+        "that of equal ones): the lamp flickers; take one on direct current, or daylight"
+    )

@@ -18,6 +18,8 @@ SLICES, GROUPS = 20, 20
 LONG_US = 20_000
 #: Windows in which the load of the read-out is counted, µs.
 WINDOW_US = 1000
+#: Lamps on alternating current flicker with twice its frequency.
+LAMPS_HZ = (100.0, 120.0)
 #: Times between turns that are kept.
 TURNS = 200_000
 #: A recording needs this much time for figures of the scatter between its parts, µs.
@@ -39,7 +41,9 @@ class EventTally:
     counts : [polarity, half of the time, pixel], ON first.
     slices : [polarity, slice of the time, group of pixels], events.
     intervals : [µs], intervals between successive events of a pixel, of any polarity; the last entry has all longer.
-    variation, pairs : [group of pixels], sums of the local variation over pairs of successive ON intervals; pairs.
+    variation, pairs : [pixel], sums of the local variation over pairs of successive ON intervals; pairs.
+    waves : [frequency, slice of the time], complex sums of the ON events' phases at each of `LAMPS_HZ`.
+    used : [pixel], pixels that rates, their spread and the local variation are taken of; all, but for hot ones.
     windows : [k], number of windows of `WINDOW_US` that hold k events; windows without events are left out.
     turns_us : first times between successive turns of a pixel from OFF to ON events, at most `TURNS`.
     """
@@ -54,13 +58,16 @@ class EventTally:
     variation: NDArray[np.float64] = field(init=False)
     pairs: NDArray[np.int64] = field(init=False)
     windows: NDArray[np.int64] = field(init=False)
+    waves: NDArray[np.complex128] = field(init=False)
+    used: NDArray[np.bool_] = field(init=False)
     turns_us: list[NDArray[np.int64]] = field(init=False)
 
     def __post_init__(self) -> None:
         pixels = self.pixels
         self.counts, self.slices = np.zeros((2, 2, pixels), np.int64), np.zeros((2, SLICES, GROUPS), np.int64)
         self.intervals, self.windows = np.zeros(LONG_US + 1, np.int64), np.zeros(1, np.int64)
-        self.variation, self.pairs = np.zeros(GROUPS), np.zeros(GROUPS, np.int64)
+        self.variation, self.pairs = np.zeros(pixels), np.zeros(pixels, np.int64)
+        self.waves, self.used = np.zeros((len(LAMPS_HZ), SLICES), np.complex128), np.ones(pixels, np.bool_)
         self.turns_us, self._turns, self._turn_us = [], 0, np.full(pixels, -1, np.int64)
         # group of each pixel: neighbours and columns are spread over all groups
         self.group = (np.arange(pixels, dtype=np.uint64) * np.uint64(2654435761) >> np.uint64(16)) % np.uint64(GROUPS)
@@ -89,6 +96,7 @@ class EventTally:
             place = piece[chosen] * GROUPS + group[chosen]
             self.slices[k] += np.bincount(place, minlength=SLICES * GROUPS).reshape(SLICES, GROUPS)
         self._load(t_us)
+        self._light(t_us[on] - self.begin_us, piece[on])
         order = np.argsort(pixel, kind="stable")
         pixel, t_us, on = pixel[order], t_us[order], on[order]
         first, last, before_us = self._before(pixel, t_us, 0)
@@ -115,9 +123,9 @@ class EventTally:
         interval = np.where(before_us >= 0, t_us - before_us, 0)
         earlier = np.where(first, self._interval_us[pixel], np.append(0, interval[:-1]))
         both = (interval > 0) & (earlier > 0)
-        a, b, group = interval[both], earlier[both], self.group[pixel[both]].astype(np.int64)
-        self.variation += np.bincount(group, 3 * ((a - b) / (a + b)) ** 2, GROUPS)
-        self.pairs += np.bincount(group, minlength=GROUPS)
+        a, b = interval[both], earlier[both]
+        self.variation += np.bincount(pixel[both], 3 * ((a - b) / (a + b)) ** 2, self.pixels)
+        self.pairs += np.bincount(pixel[both], minlength=self.pixels)
         self._last_us[1, pixel[last]], self._interval_us[pixel[last]] = t_us[last], interval[last]
 
     def _take_turns(self, pixel: NDArray[np.int64], t_us: NDArray[np.int64]) -> None:
@@ -137,6 +145,16 @@ class EventTally:
         every = np.concatenate(self.turns_us)
         near = np.abs(every / np.median(every) - 1) < 0.3
         return float(every[near].mean()) / US_PER_S
+
+    def _light(self, t_us: NDArray[np.int64], piece: NDArray[np.int64]) -> None:
+        for k, hz in enumerate(LAMPS_HZ):
+            phase = (2 * np.pi * hz / US_PER_S) * t_us
+            self.waves[k] += np.bincount(piece, np.cos(phase), SLICES) + 1j * np.bincount(piece, np.sin(phase), SLICES)
+
+    def by_group(self, values: NDArray) -> NDArray[np.float64]:
+        """Sums of values [pixel] over the pixels of each group that are used."""
+        sums = np.bincount(self.group[self.used].astype(np.int64), values[self.used], GROUPS)
+        return np.asarray(sums, np.float64)
 
     def _load(self, t_us: NDArray[np.int64]) -> None:
         window = (t_us - self.begin_us) // WINDOW_US

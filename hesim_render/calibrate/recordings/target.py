@@ -49,7 +49,7 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     leak_hz : leak while the target moved, Hz: half of it is in the ON events of the rise, half missing in the fall.
     """
     count = tally.per_pixel().astype(np.float64)
-    both = count.min(axis=0)
+    both = np.where(tally.used, count.min(axis=0), 0.0)
     seen = both > 0.25 * np.median(both[both > 0]) if both.any() else np.zeros(both.size, np.bool_)
     if np.count_nonzero(seen) < 2 * GROUPS:
         return unknown(f"{np.count_nonzero(seen)} pixels have events of both polarities; {2 * GROUPS} are needed")
