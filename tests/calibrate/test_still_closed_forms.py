@@ -271,7 +271,11 @@ def test_the_readout_limit_is_the_mean_of_the_fullest_windows():
 def test_a_target_whose_cycles_do_not_show_tells_no_thresholds():
     count = np.full((2, 3 * target.GROUPS), 40.0)
     tally = SimpleNamespace(
-        per_pixel=lambda: count, period_s=lambda: None, seconds=3.0, group=np.arange(count.shape[1])
+        per_pixel=lambda: count,
+        period_s=lambda: None,
+        seconds=3.0,
+        group=np.arange(count.shape[1]),
+        used=np.ones(count.shape[1], np.bool_),
     )
     found = target.thresholds(tally, 2.0, None)
     assert "a pixel sees 0 cycles of the target, with 0 events of a polarity" in found.ratio["reason"]
@@ -315,7 +319,8 @@ def test_a_tenth_of_the_leak_is_an_error_of_the_thresholds_of_a_target(monkeypat
 
     monkeypatch.setattr(target, "_Simulated", Simulated)
     count = np.array([[40.0], [30.0]]) * np.ones(4 * target.GROUPS)
-    tally = SimpleNamespace(per_pixel=lambda: count, seconds=3.0, group=np.arange(count.shape[1]) % target.GROUPS)
+    group, used = np.arange(count.shape[1]) % target.GROUPS, np.ones(count.shape[1], np.bool_)
+    tally = SimpleNamespace(per_pixel=lambda: count, seconds=3.0, group=group, used=used)
     found = target.thresholds(tally, 2.0, 4.0, 4.0)
     assert seen[0] == (pytest.approx(np.log(2)), 12)
     assert seen[1] == pytest.approx([(40 - 6) / 12, (30 + 12 * 15 / 28) / 12, 0])
