@@ -12,6 +12,7 @@ from scipy.stats import norm
 from hesim_render.core.errors import SpecError
 from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, s_curves
 from hesim_render.report.bench import EventBench
+from hesim_render.report.definitions import FRAMES
 from hesim_render.report.estimates import crossing, log_estimated, mean_error, quantile, whole_us_quantile
 from hesim_render.report.latency import Answers
 from hesim_render.report.steady import Background, _rate, doubling
@@ -385,3 +386,23 @@ def test_what_an_s_curve_lacks_is_said():
     steep = s_curves._problem(size, np.array([0.01, 0.02, 0.96, 0.98]), 20)
     assert steep and "0.2" in steep and "0.3" in steep
     assert s_curves._problem(size, np.array([0.01, 0.04, 0.96, 0.98]), 20) == ""
+
+
+@pytest.mark.parametrize("has_photons", (True, False))
+def test_figures_of_frames_have_the_light_they_were_measured_in(has_photons):
+    """Levels of 10 to 100 % of saturation, of which the last is not clear; a long series at half of it."""
+    light = np.linspace(100.0, 1000.0, 10) * (1.0 if has_photons else 1e-6)
+    result = SimpleNamespace(
+        light=light, signal=np.linspace(20.0, 200.0, 10), top_dn=200.0, clear=np.arange(10) < 9,
+        pairs=SimpleNamespace(
+            has_photons=has_photons, spatial_lit=SimpleNamespace(photons=500.0 if has_photons else None, exposure_s=5e-4)
+        ),
+    )  # fmt: skip
+    lights = emva.FrameFigures(result, {}, []).lights
+    assert set(lights) == set(FRAMES)
+    if has_photons:
+        assert lights["K"] == "100 to 700 photons" and lights["full_well_e"] == "up to 1000 photons"
+        assert lights["prnu_percent"] == "500 photons, and dark" and lights["dsnu_e"] == "dark"
+        assert lights["linearity_error_percent"] == "100 to 900 photons"
+    else:
+        assert lights["K"] == "0.1 to 0.7 ms" and lights["prnu_percent"] == "0.5 ms, and dark"
