@@ -395,7 +395,8 @@ def test_figures_of_frames_have_the_light_they_were_measured_in(has_photons):
     result = SimpleNamespace(
         light=light, signal=np.linspace(20.0, 200.0, 10), top_dn=200.0, clear=np.arange(10) < 9,
         pairs=SimpleNamespace(
-            has_photons=has_photons, spatial_lit=SimpleNamespace(photons=500.0 if has_photons else None, exposure_s=5e-4)
+            has_photons=has_photons,
+            spatial_lit=SimpleNamespace(photons=500.0 if has_photons else None, exposure_s=5e-4),
         ),
     )  # fmt: skip
     lights = emva.FrameFigures(result, {}, []).lights
