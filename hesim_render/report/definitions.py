@@ -113,7 +113,7 @@ EVENTS: dict[str, Definition] = {
     "dead": Definition(
         "dead pixels",
         "Share of pixels that answer fewer than half of the largest steps.",
-        "n(answers < 1/2)/pixels", "the largest steps of the S-curve",
+        "n(share of answers < 1/2)/pixels", "the largest steps of the S-curve",
     ),
 }  # fmt: skip
 
@@ -148,5 +148,6 @@ FRAMES: dict[str, Definition] = {
                                "dark pairs and series"),
     "column_noise_dn": Definition("temporal column noise", "Noise that the pixels of a column share.",
                                   "σ of column means", "dark pairs and series"),
-    "defect_pixels": Definition("defect pixels", "Pixels unlike the others in the dark or in the light.", "", "series"),
+    "defect_pixels": Definition("defect pixels", "Pixels unlike the others in the dark or in the light.",
+                                "|x − x̄ around it| > 8 robust σ, or stuck at 0 or full scale", "dark and lit series"),
 }  # fmt: skip

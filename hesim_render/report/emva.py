@@ -14,6 +14,7 @@ from hesim_render.calibrate.aps.pairs_output import content
 from hesim_render.calibrate.estimate import estimated, not_identifiable
 from hesim_render.calibrate.moments import Progress
 from hesim_render.recording.pair_set import read_pair_set
+from hesim_render.report.estimates import figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,32 @@ class FrameFigures:
     def pixels(self) -> int:
         rows, cols = self.result.pairs.shape
         return rows * cols
+
+    @property
+    def lights(self) -> dict[str, str]:
+        """The light that each figure was measured in."""
+        result = self.result
+        has_photons = result.pairs.has_photons
+        scale, unit = (1.0, "photons") if has_photons else (1e3, "ms")
+
+        def between(part: float, to: float) -> str:
+            top = result.top_dn
+            used = result.light[result.clear & (result.signal >= part * top) & (result.signal <= to * top)] * scale
+            return f"{figure(used.min(), 3)} to {figure(used.max(), 3)} {unit}" if used.size else ""
+
+        fitted, most = between(0.0, 0.7), f"up to {figure(result.light.max() * scale, 3)} {unit}"
+        long = result.pairs.spatial_lit
+        light = (long.photons or 0.0) if has_photons else 1e3 * long.exposure_s
+        series = f"{figure(light, 3)} {unit}, and dark"
+        return {
+            "K": fitted, "responsivity": fitted, "quantum_efficiency": fitted, "full_well_e": most, "snr_max": most,
+            "dynamic_range": f"{most}, and dark", "threshold_photons": f"{fitted}, and dark",
+            "threshold_e": f"{fitted}, and dark", "prnu_percent": series, "defect_pixels": series,
+            "linearity_error_percent": between(0.05, 0.95),
+            **dict.fromkeys(
+                ("temporal_dark_noise_e", "dark_current_e_per_s", "dsnu_e", "row_noise_dn", "column_noise_dn"), "dark"
+            ),
+        }  # fmt: skip
 
 
 def frame_figures(folder: str | Path, progress: Progress | None = None) -> FrameFigures:

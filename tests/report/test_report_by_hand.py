@@ -12,6 +12,7 @@ from scipy.stats import norm
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, run, s_curves, simulate
 from hesim_render.report.bench import EventBench
+from hesim_render.report.definitions import FRAMES
 from hesim_render.report.estimates import crossing, log_estimated, mean_error, quantile, whole_us_quantile
 from hesim_render.report.latency import Answers
 from hesim_render.report.s_curves import SCurve
@@ -585,3 +586,24 @@ def test_a_report_has_each_table_once_and_a_page_for_each_kind_of_pixels(kinds, 
     assert [one[1] for one in told[1:] if one[0] == "text"] == texts
     # frames alone have a page of figures, and both kinds begin pages of their own
     assert told.count(("new_page",)) == (0 if kinds == ("events",) else 1) and told[-1] == ("close",)
+
+
+@pytest.mark.parametrize("has_photons", (True, False))
+def test_figures_of_frames_have_the_light_they_were_measured_in(has_photons):
+    """Levels of 10 to 100 % of saturation, of which the last is not clear; a long series at half of it."""
+    light = np.linspace(100.0, 1000.0, 10) * (1.0 if has_photons else 1e-6)
+    result = SimpleNamespace(
+        light=light, signal=np.linspace(20.0, 200.0, 10), top_dn=200.0, clear=np.arange(10) < 9,
+        pairs=SimpleNamespace(
+            has_photons=has_photons,
+            spatial_lit=SimpleNamespace(photons=500.0 if has_photons else None, exposure_s=5e-4),
+        ),
+    )  # fmt: skip
+    lights = emva.FrameFigures(result, {}, []).lights
+    assert set(lights) == set(FRAMES)
+    if has_photons:
+        assert lights["K"] == "100 to 700 photons" and lights["full_well_e"] == "up to 1000 photons"
+        assert lights["prnu_percent"] == "500 photons, and dark" and lights["dsnu_e"] == "dark"
+        assert lights["linearity_error_percent"] == "100 to 900 photons"
+    else:
+        assert lights["K"] == "0.1 to 0.7 ms" and lights["prnu_percent"] == "0.5 ms, and dark"
