@@ -141,7 +141,7 @@ class EventDistance:
     ----------
     name, definition : what it is, and how it is defined.
     value : distance, 0 for equal streams.
-    interval_95 : of the bootstrap.
+    interval_95 : of the bootstrap, centred on the value.
     within : distance of two draws of the first stream, of which 95 of 100 are below.
     first, second : what it is the distance of, where that is a number.
     """
@@ -195,13 +195,15 @@ def event_distances(first: EventStatistics, second: EventStatistics, seed: int =
         theirs = [figure(second, draw) for draw in draws[2]]
         spread = [distance(x, y) for x, y in zip(ours, theirs, strict=True)]
         own = [distance(x, y) for x, y in zip(ours, again, strict=True)]
-        low, high = np.percentile(spread, (2.5, 97.5))
+        value = float(distance(a, b))
+        # drawn parts repeat, which shifts a distance: the draws are centred on that of the whole
+        low, high = np.maximum(np.percentile(spread, (2.5, 97.5)) + value - np.median(spread), 0.0)
         numbers = (float(a[0]), float(b[0])) if is_number else (None, None)
         result.append(
             EventDistance(
                 name,
                 definition,
-                float(distance(a, b)),
+                value,
                 (float(low), float(high)),
                 float(np.percentile(own, 95)),
                 *numbers,

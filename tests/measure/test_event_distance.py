@@ -173,6 +173,17 @@ def test_intervals_and_bounds_are_those_of_the_bootstrap():
     ]  # fmt: skip
 
 
+def test_an_interval_holds_its_value_where_drawn_parts_have_other_ones():
+    """Hot pixels of a part alone: in drawn parts, which repeat, fewer pixels are hot, or more of them."""
+    one, other = poisson(21), poisson(22)
+    one.pixels[:] = 1
+    for part in range(20):
+        one.pixels[part, 40 * part : 40 * part + 5] = 220
+    found = {d.name: d for d in event_distances(one, other)}["hot pixels"]
+    low, high = found.interval_95
+    assert found.value == pytest.approx(100 / PIXELS) and low < found.value < high
+
+
 def test_the_shortest_stream_has_two_windows_a_part():
     rng = np.random.default_rng(2)
     for last_us, enough in ((39_980, True), (39_979, False)):
