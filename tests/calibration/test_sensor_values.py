@@ -42,7 +42,7 @@ def test_values_of_frames():
     more = {"column_noise_dn": 0.4, "read_noise_correlation": 0.15, "column_offset_std_dn": 0.8}
     given = frames(
         column_noise_dn=item(0.4), read_noise_correlation=item(0.15), column_offset_std_dn=0.8,
-        full_well_e=SimpleNamespace(limited_by="full well", value=9000.0),
+        full_well_e=SimpleNamespace(limited_by="full well", value=8700.0, cut_off_e=9000.0),
     )  # fmt: skip
     assert _aps_values({"bit_depth": 10}, CAPTURE, given, FILE) == plain | more | {"full_well_e": 9000.0}
 
