@@ -160,5 +160,7 @@ def in_options(error: HesimError, program: Any, given: Sequence[str]) -> str:
         command = getattr(command, "commands", {}).get(word, command)
     options = {param.name.rstrip("_"): max(param.opts, key=len) for param in command.params if param.opts}
     fitting = [option for own, option in options.items() if own == name]
-    fitting += [option for own, option in options.items() if name.startswith(f"{own}_") or name.endswith(f"_{own}")]
+    # of a target and of its contrast the latter: the longer name says more
+    parts = [own for own in options if name.startswith(f"{own}_") or name.endswith(f"_{own}")]
+    fitting += [options[own] for own in sorted(parts, key=len, reverse=True)]
     return next((f"{option}{text[len(name) :]}" for option in fitting if option.startswith("--")), text)

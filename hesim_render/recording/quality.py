@@ -61,9 +61,7 @@ def verdict_lines(audits: Mapping[str, dict[str, Any] | None], noun: str) -> lis
         remedies = [f"quality {min(quality):g} would do"] if quality else []
         remedies += [f"{max(samples)} samples would do"] if samples else []
         capped = sum(bool(audit.get("short_of_rays")) for audit in short.values())
-        remedies += (
-            [f"no quality would do for {capped}, whose values have the most rays that they may have"] if capped else []
-        )
+        remedies += [f"no quality would do for {capped} of them, which need the exact mode"] if capped else []
         text = f"NOT MET: {len(short)} of {len(audits)} {noun} are worse than asked for ({names})"
         lines.append("; ".join([text, *remedies]))
     if unknown:
@@ -110,9 +108,9 @@ def _verdict(audit: dict[str, Any]) -> list[str]:
             ]
         if audit.get("short_of_rays"):
             return [
-                "NOT MET: this run is worse than asked for; the most rays that a value may have are too few for "
-                f"{_percent(audit['short_of_rays'])} of the values, so no --quality would do; the exact mode "
-                "(--samples) has no such limit"
+                f"NOT MET: by their stated error {_percent(audit['short_of_rays'])} of the values are off by more than "
+                f"{audit['tolerance_noise']:g} of the sensor's noise, with the most rays that a value may have; no "
+                "--quality would do, but the exact mode (--samples) has no such limit"
             ]
         return [f"NOT MET: this run is worse than asked for; --quality {audit['quality_needed']:g} would do"]
     if audit.get("verdict") == "not shown":

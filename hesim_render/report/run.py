@@ -228,9 +228,10 @@ def _json(name: str, events: EventFigures | None, frames: FrameFigures | None, f
             band = asdict(events.band)
             whole["events"]["swing_of_half"] = {key: band[key] for key in ("lux", "hz", "swing")}
     if frames is not None:
+        lights = frames.lights
         whole["frames"] = {
             "shape": list(frames.result.pairs.shape), "pixels": frames.pixels,
-            "figures": {key: {**entry, "light": frames.lights[key]} for key, entry in frames.entries.items()},
+            "figures": {key: {**entry, "light": lights[key]} for key, entry in frames.entries.items()},
             "definitions": {key: one._asdict() for key, one in FRAMES.items()},
         }  # fmt: skip
     return json.dumps(plain(whole), indent=1, ensure_ascii=False) + "\n"

@@ -26,6 +26,8 @@ from hesim_render.measure import measure_mtf
     (["simulate", "dark"], "seed", "--seed"),
     (["simulate", "dark"], "scene", "scene"),  # an argument, no option
     (["simulate", "dark"], "shape of the RAW frame", "shape of the RAW frame"),
+    (["calibrate", "recording", "a"], "target_contrast", "--contrast"),  # of --target and --contrast the longer one
+    (["calibrate", "recording", "a"], "target_file", "--target"),
     (["view", "r"], "seed", "seed"),  # a command without it
     ([], "seed", "seed"),
 ])  # fmt: skip

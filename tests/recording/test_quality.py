@@ -107,11 +107,9 @@ def test_a_run_whose_values_have_the_most_rays_names_no_quality():
         line for line in render_lines({"error_noise": error, "quality": 0.5, "audit": audit}) if "NOT MET" in line
     )
     assert line.endswith(
-        "the most rays that a value may have are too few for 31 % of the values, so no --quality would do; the exact "
-        "mode (--samples) has no such limit"
+        "by their stated error 31 % of the values are off by more than 1.5 of the sensor's noise, with the most rays "
+        "that a value may have; no --quality would do, but the exact mode (--samples) has no such limit"
     )
     many = {"a": capped, "b": {"verdict": "not met", "quality_needed": 0.3}, "c": capped, "d": {"verdict": "met"}}
     (line,) = verdict_lines(many, "clips")
-    assert line.endswith(
-        "quality 0.3 would do; no quality would do for 2, whose values have the most rays that they may have"
-    )
+    assert line.endswith("quality 0.3 would do; no quality would do for 2 of them, which need the exact mode")

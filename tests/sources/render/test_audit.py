@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 from scipy.special import logsumexp
+from scipy.stats import norm
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
@@ -307,7 +308,7 @@ def test_the_verdict_is_that_of_the_worst_share():
     judge = Audit(None, None, 0.4, None, np.arange(3), 1)._verdict
 
     def part(off=0.0, bound=0.02, p99=0.8, **events):
-        shares = {"off": off, "off_at_most": bound, "off_wanted_at_most": 0.02, "short_of_rays": 0.01}
+        shares = {"off": off, "off_at_most": bound, "off_wanted_at_most": 0.02, "off_by_stated_error_alone": 0.01}
         return shares | {"deviation_noise": {"p99": p99}} | events
 
     def of_events(name, share, bound, limit):
@@ -528,26 +529,31 @@ def test_a_change_of_exactly_the_threshold_is_no_event_of_pixels_with_ticks():
     np.testing.assert_array_equal(counted.in_run, [0, 2, 0])
 
 
-class Stated(Given):
-    """A fifth of the pixels states an error of 1.2 of the noise, the others of 0.9: wanted is 0.5."""
+class Halves(Given):
+    """Halves that differ by noise of 2.7 units, which is the error of the run."""
 
     def flux_of_blocks(self, pixel, blocks):
+        rng = np.random.default_rng(6)
         for sample in super().flux_of_blocks(pixel, blocks):
-            stated = UNIT * self.run[0] * np.where(np.arange(self.run.shape[1]) % 5 == 0, 1.2, 0.9)
-            yield Sample(sample.half_a, sample.half_b, stated[pixel].astype(np.float32))
+            apart = type(sample.half_a)((2.7 * UNIT * self.run[0][pixel] * rng.normal(size=pixel.size)).astype("f4"))
+            yield Sample(sample.half_a + apart, sample.half_b - apart, sample.error)
 
 
-def test_values_whose_stated_error_is_far_above_the_wanted_one_are_short_of_rays(monkeypatch):
-    monkeypatch.setattr(audit_module, "_RAYS", 10**9)
-    truth = np.full((TICKS, ROWS * COLS), 1e5)
-    sensor, source = sensor_of(), Stated(truth, truth)
+def test_values_that_are_off_by_their_own_stated_error_have_no_quality_that_would_do():
+    truth = np.full((TICKS, ROWS * COLS), 1.3e5)
+    run = truth * (1 + 2.7 * UNIT * np.random.default_rng(2).normal(size=truth.shape))
+    sensor, source = sensor_of(), Halves(run, truth)
     pixels = sensor.layout.evs_pixel.ravel()
     noted = NotedFlux(source, pixels, TICKS, 1, *STRETCHES["previous_sample"], 2)
     for _ in noted.flux_of_blocks(pixels, tick_blocks(sensor.spec.evs, 0, TICKS * TICK_US)):
         pass
     report = Audit(noted, source, QUALITY, sensor.evs, pixels, 2).run()
-    assert report["events"]["short_of_rays"] == pytest.approx(0.2, abs=0.05)
-    assert report["verdict"] != "not met" and report["short_of_rays"] is None
+    # a deviation beyond 3 q = 1.5 units, of 2.7
+    assert report["short_of_rays"] == pytest.approx(2 * norm.sf(1.5 / 2.7), abs=0.06)
+    assert report["verdict"] == "not met" and report["quality_needed"] is None
+    # the same errors with halves that state none: rays were missed, not short
+    report = audited(run, truth, 2)
+    assert report["short_of_rays"] is None and report["quality_needed"] == pytest.approx(0.5 * 1.5 / 6.95, rel=0.15)
 
 
 @pytest.mark.parametrize(("p99", "short", "quality", "told"), [
@@ -556,9 +562,10 @@ def test_values_whose_stated_error_is_far_above_the_wanted_one_are_short_of_rays
     (9.3, 0.013, 0.08, None),  # off for other reasons
 ])  # fmt: skip
 def test_no_quality_is_named_where_values_have_the_most_rays(p99, short, quality, told):
-    part = {"off": 0.4, "off_at_most": 0.5, "off_wanted_at_most": 0.02, "short_of_rays": short}
+    part = {"off": 0.4, "off_at_most": 0.5, "off_wanted_at_most": 0.02, "off_by_stated_error_alone": short}
     audit = Audit(None, None, QUALITY, None, np.arange(3), 1)
-    verdict = audit._verdict([part | {"deviation_noise": {"p99": p99}}])
+    other = part | {"off": 0.0, "off_at_most": 0.01, "off_by_stated_error_alone": 0.001}
+    verdict = audit._verdict([each | {"deviation_noise": {"p99": p99}} for each in (other, part)])
     assert verdict == {"verdict": "not met", "quality_needed": pytest.approx(quality), "short_of_rays": told}
 
 

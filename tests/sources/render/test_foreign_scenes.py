@@ -34,6 +34,7 @@ from hesim_render.specs.motion import TrackSpec
 
 COLS, ROWS = 16, 12
 DOCS = Path(__file__).parents[3] / "docs" / "scenes.md"
+BENCHMARK = Path(__file__).parents[3] / "benchmarks" / "scenes"
 
 
 def even(value):
@@ -168,6 +169,21 @@ def test_a_pixel_in_which_no_ray_saw_light_states_the_error_that_is_wanted():
     # beside the ball the pilot, which starts rays a little further out, saw light, and more is wanted there
     assert np.all(half[dark] > 0.999 * wanted[dark]) and np.mean(half[dark] < 1.001 * wanted[dark]) > 0.9
     assert source.counts.rays >= 64 * pixel.size
+
+
+@pytest.mark.parametrize("name", ["room", "floor-ball", "copper", "glass-ball"])
+def test_the_scenes_of_the_benchmark_take_the_default_mode_and_move(name):
+    sensor = hr.load_sensor("davis346").crop(24, 18, 140, 100)
+    source = ChangeDrivenFlux(hr.load_scene(BENCHMARK / f"{name}.yaml"), sensor, seed=3)
+    assert not source.is_static and source.settings["mode"] == "change-driven"
+
+
+def test_a_run_of_polished_copper_says_that_no_quality_would_do():
+    scene, sensor = hr.load_scene(BENCHMARK / "copper.yaml"), hr.load_sensor("davis346").crop(48, 36, 140, 100)
+    audit = hr.simulate(scene, sensor, duration_s=0.003, seed=5).manifest["settings"]["render"]["audit"]
+    assert audit["verdict"] == "not met" and audit["quality_needed"] is None
+    parts = [audit[name]["off_by_stated_error_alone"] for name in ("events", "frames") if name in audit]
+    assert audit["short_of_rays"] == max(parts) > 0.02
 
 
 def furnace(integrator, depth=None):

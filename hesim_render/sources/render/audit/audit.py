@@ -33,8 +33,6 @@ STRETCHES = {"previous_sample": (2, 1, 1), "last_event": (1, 8, 1)}
 _MOST_EVENTS = {"previous_sample": 1, "last_event": 8}
 #: Units of pixels that no moving object can come near: this part is rendered again, with a weight of 1 over it.
 _STILL_PART = 0.25
-#: A value is short of rays if its stated error is this many wanted ones: powers of two and differences make up to 1.5.
-_SHORT = 2.0
 #: Quality of the reference, as a part of the quality of the run.
 _REFERENCE = 0.5
 #: What an audit can see, for the manifest.
@@ -165,7 +163,6 @@ class Audit:
         deviation, weight = np.abs(units.flux - reference)[core] / unit, np.where(still, 1 / _STILL_PART, 1.0)
         tally.off[place] = weight * np.mean(deviation > tolerance, axis=0)
         tally.expected[place] = weight * np.mean(np.abs(units.difference[core]) > tolerance * unit, axis=0)
-        tally.short_of_rays[place] = weight * np.mean(units.error[core] > _SHORT * self._quality * unit, axis=0)
         tally.note(place, deviation, weight)
         if events:
             moving = np.flatnonzero(~still)
@@ -255,7 +252,6 @@ class Audit:
                 "largest": float(deviation[-1]),
             },
             "off_by_stated_error_alone": float(tally.expected[: tally.looked_at].mean()),
-            "short_of_rays": float(tally.short_of_rays[: tally.looked_at].mean()),
         }
         return bounds | self._event_bounds(tally) if events else bounds
 
@@ -295,8 +291,8 @@ class Audit:
         failed = any(share > most for share, _, most in shares)
         shown = all(bound <= most for _, bound, most in shares)
         needed = min(needed, 0.7 * self._quality)
-        # a quality that asks for more rays than a value may have would not do either
-        short = max((part["short_of_rays"] for part in parts), default=0.0)
+        # values that are off by their own stated error already have the most rays that one may have
+        short = max((part["off_by_stated_error_alone"] for part in parts), default=0.0)
         capped = failed and needed < FINEST_QUALITY and short > MOST_OFF
         return {
             "verdict": "not met" if failed else "met" if shown else "not shown",

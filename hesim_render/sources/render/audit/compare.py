@@ -148,14 +148,13 @@ class Tally:
     ----------
     off : share of values off by more than the tolerance, times the weight of the unit.
     expected : the share that the stated error of the run alone would put there, times the weight.
-    short_of_rays : share of values whose stated error is far above the wanted one, times the weight.
     events : counts from `compare`. `by_error` : counts after the stated error is added to the reference.
     eventful : length of the first part in which all units with events in the run were examined.
     looked_at : length of the first part in which all units were examined.
     """
 
     def __init__(self, units: int) -> None:
-        self.off, self.expected, self.short_of_rays, self.by_error = (np.zeros(units) for _ in range(4))
+        self.off, self.expected, self.by_error = (np.zeros(units) for _ in range(3))
         self.events = Counted(*(np.zeros(units) for _ in range(5)))
         self.has_event = np.zeros(units, np.bool_)
         self.eventful = self.looked_at = 0
