@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,6 +23,7 @@ from hesim_render.sources.render.change_driven.estimates import Flux
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer, Windows
 from hesim_render.sources.render.change_driven.sample_instants import STEP_PX, MotionClock
+from hesim_render.sources.render.change_driven.tuning import TUNING
 from hesim_render.sources.render.exact import RenderedFlux, used_responses
 from hesim_render.sources.render.scene import plugin_tables
 from hesim_render.sources.render.scene.builder import build
@@ -158,17 +160,20 @@ def test_a_pixel_in_which_no_ray_saw_light_states_the_error_that_is_wanted():
     black = {"type": "diffuse", "reflectance": even(0.0)}
     shapes = {"floor": {**FLOOR, "bsdf": black}, "lamp": LAMP, "ball": {**BALL, "bsdf": {"type": "plastic"}}}
     sensor, quality = hr.load_sensor("davis346").crop(COLS, ROWS), 0.7
-    source = ChangeDrivenFlux(mitsuba_scene(shapes), sensor, quality, 3)
     pixel = sensor.layout.evs_pixel.ravel()
-    out = Flux.zeros(1, pixel.size)
-    begin = np.full(pixel.size, 100.0)
-    source._renderer.alone(pixel, begin, begin + 1, "events", out)
+    begin, rays = np.full(pixel.size, 100.0), []
+    for least in (8, 64):
+        source = ChangeDrivenFlux(mitsuba_scene(shapes), sensor, quality, 3, tuning=replace(TUNING, dark_rays=least))
+        out = Flux.zeros(1, pixel.size)
+        source._renderer.alone(pixel, begin, begin + 1, "events", out)
+        rays.append(source.counts.rays)
     half, dark = 0.5 * np.abs(out.half_a - out.half_b)[0], (out.half_a + out.half_b)[0] == 0
     assert 120 < dark.sum() < 180
     wanted = quality * source.noise_unit(pixel, np.zeros((1, pixel.size)), True)[0]
     # beside the ball the pilot, which starts rays a little further out, saw light, and more is wanted there
     assert np.all(half[dark] > 0.999 * wanted[dark]) and np.mean(half[dark] < 1.001 * wanted[dark]) > 0.9
-    assert source.counts.rays >= 64 * pixel.size
+    # black pixels with nothing bright beside them take 8 rays otherwise
+    assert rays[1] - rays[0] > 56 * 0.5 * dark.sum() and TUNING.dark_rays == 64
 
 
 @pytest.mark.parametrize("name", ["room", "floor-ball", "copper", "glass-ball"])
