@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 #: t_us: end of the event's integration window, µs; x, y: column and row on the event grid, (0, 0) at
 #: the top left; polarity: +1 (ON) or -1 (OFF).
@@ -31,6 +31,14 @@ class Origin(IntEnum):
 def no_events() -> NDArray:
     """An empty event array."""
     return np.empty(0, dtype=EVENT_DTYPE)
+
+
+def events_at(t_us: ArrayLike, pixel: NDArray[np.integer], polarity: ArrayLike, cols: int) -> NDArray[np.void]:
+    """Structured array of events at flat pixel indices of an event grid `cols` wide."""
+    events = np.empty(len(pixel), EVENT_DTYPE)
+    events["t_us"], events["polarity"] = t_us, polarity
+    events["y"], events["x"] = np.divmod(pixel.astype(np.uint32), np.uint32(cols))
+    return events
 
 
 class Label(IntEnum):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, UInt32, device_namespace
 from hesim_render.mosaic.layout import Layout
-from hesim_render.pixels.arrays import to_device
+from hesim_render.pixels.arrays import take, to_device
 from hesim_render.pixels.evs import formulas
 from hesim_render.pixels.evs.formulas import Coefficients, ShotLaw
 from hesim_render.specs.event_pixels import PhotoreceptorSpec
@@ -55,6 +56,15 @@ class EventPixels:
         self._coefficients = table.each(of_position)
         self._reference_level: Float = None if reference_level is None else of_position(reference_level)
         self._noise_filter, self._bandwidth_hz = noise_filter, bandwidth_hz
+
+    def at(self, pixel: UInt32) -> EventPixels:
+        """The same of some pixels."""
+        some = copy(self)
+        some.key = take(self.key, pixel)
+        some.thresholds = take(self.thresholds[0], pixel), take(self.thresholds[1], pixel)
+        some._coefficients = self._coefficients.each(lambda values: take(values, pixel))
+        some._reference_level = None if self._reference_level is None else take(self._reference_level, pixel)
+        return some
 
     def log_level(self, electrons: Float) -> tuple[Float, Float]:
         """`EvsNoise.log_level`."""

@@ -17,9 +17,10 @@ from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError
 from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.pixels.arrays import restore, saved
-from hesim_render.pixels.evs.comparison import LastEvent, PreviousSample
 from hesim_render.pixels.evs.defects import DefectEvents
+from hesim_render.pixels.evs.last_event import LastEvent
 from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.evs.previous_sample import PreviousSample
 
 #: Rows by which the start of the scan moves per microsecond, as a fraction of all rows: the golden section × 2³².
 _GOLDEN = 2654435769

@@ -2,7 +2,7 @@
 
 The level of comparison of each pixel is drawn from its law (`hesim_render.pixels.evs.start`), with the
 thresholds, the noise and the bandwidth that the pixel has in the light of the first sample. Then the pixels run for a
-few periods of their noise, whose events nobody sees (`hesim_render.pixels.evs.comparison.LastEvent`).
+few periods of their noise, whose events nobody sees (`hesim_render.pixels.evs.last_event.LastEvent`).
 
 The laws are known at nodes of thresholds over noise and of the bandwidth. Between nodes, quantiles are interpolated.
 

@@ -1,23 +1,23 @@
-"""Comparison of each pixel's level with its reference: the previous sample, or the level of its last event."""
+"""Asynchronous event pixels: each compares its level with that of its last event."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
-from hesim_render.core.rng import Stream, normal_pair, philox
-from hesim_render.core.units import S_PER_US
+from hesim_render.core.rng import Stream
 from hesim_render.pixels.arrays import take
+from hesim_render.pixels.evs.crossings import DueEvents, events_on_paths, of_pixels
 from hesim_render.pixels.evs.defects import DefectEvents
-from hesim_render.pixels.evs.events import EVENT_DTYPE, Origin, no_events
-from hesim_render.pixels.evs.formulas import leak_probability
+from hesim_render.pixels.evs.events import Origin, events_at, no_events
 from hesim_render.pixels.evs.leak_drift import LeakDrift
 from hesim_render.pixels.evs.model import EvsNoise
-from hesim_render.pixels.evs.photoreceptor import Photoreceptor
+from hesim_render.pixels.evs.photoreceptor import Instant, Photoreceptor
 from hesim_render.pixels.evs.processes import BandNoise, RandomEvents
 from hesim_render.pixels.evs.refractory import LONG_AGO_US, Refractory
 from hesim_render.pixels.evs.start import start_chances, start_of
@@ -26,94 +26,16 @@ from hesim_render.pixels.evs.start import start_chances, start_of
 #: one another.
 _SETTLING_PERIODS = 4
 
-
-def _events(t_us: ArrayLike, pixel: NDArray[np.integer], polarity: ArrayLike, cols: int) -> NDArray[np.void]:
-    """Structured array of events at flat pixel indices of an event grid `cols` wide."""
-    events = np.empty(len(pixel), EVENT_DTYPE)
-    events["t_us"], events["polarity"] = t_us, polarity
-    events["y"], events["x"] = np.divmod(pixel.astype(np.uint32), np.uint32(cols))
-    return events
-
-
-def _nodes_us(t_us: int, *parts: BandNoise | Photoreceptor | None) -> list[float]:
-    """Ends of the segments up to the sample at `t_us`, in each of which the level goes on a straight line."""
-    return [*sorted(set().union(*(part.nodes_us(t_us) for part in parts if part))), float(t_us)]
-
-
+#: Share of a threshold by which a level must stay below it to count as far from it: rounding is smaller.
+_MARGIN_REL = 1e-4
+#: Pixels whose paths are on the host at a time.
+_PATHS = 1 << 16
 #: Processes of events at random times: the polarity times the `Origin` of their events, and their random numbers.
 _RANDOM = {
     int(Origin.LEAK): Stream.EVS_LEAK,
     int(Origin.COMPARATOR_NOISE): Stream.COMPARATOR_ON,
     -int(Origin.COMPARATOR_NOISE): Stream.COMPARATOR_OFF,
 }
-
-
-class PreviousSample:
-    """Compares successive samples."""
-
-    STATE = ("_t_us", "_level", "_variance", "_photoreceptor")
-
-    def __init__(self, noise: EvsNoise, seed: int, defects: DefectEvents | None) -> None:
-        self._noise, self._seed, self._defects = noise, seed, defects
-        self._cols = noise.layout.evs_shape[1]
-        self._independent = noise.spec.noise_mode == "independent"
-        self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
-        self._t_us = 0
-        self._level: Float = None  # ln x, with the noise of its instant where that is shared
-        self._variance: Float = None  # s²/x² of the last sample, where noise is independent
-
-    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
-        import drjit as dr
-
-        types = jit()
-        level, variance = self._noise.log_level(electrons)
-        if self._photoreceptor:
-            level = self._photoreceptor.follow(level, t_us)
-        # four random words for each pixel and sample: two for the noise, one for a leak event, one for the comparators'
-        # own noise
-        word = philox(self._seed, Stream.EVS, self._noise.on_device.key, t_us).next_uint32x4()
-        deviate = normal_pair(word[0], word[1])[0]
-        if not self._independent:
-            # shared noise: the noise of a sample is in both of its comparisons
-            level = dr.fma(dr.sqrt(variance), deviate, level)
-        if self._level is None:
-            self._keep(level, variance, t_us)
-            return no_events()
-        change = level - self._level
-        if self._independent:
-            # independent noise: each comparison draws that of both samples anew
-            change = dr.fma(dr.sqrt(variance + self._variance), deviate, change)
-        theta_on, theta_off = self._noise.on_device.thresholds
-        on, off = change > theta_on, change < -theta_off
-        polarity = dr.select(on, types.Int8(1), dr.select(off, types.Int8(-1), types.Int8(0)))
-        if self._noise.leak_rate_hz > 0:
-            probability = leak_probability(self._noise.leak_rate_hz, (t_us - self._t_us) * S_PER_US)
-            # a whole number of 2³² as the bound, opaque so that no rate is written into the kernel
-            leaks = word[2] < dr.opaque(types.UInt32, min(round(probability * 2**32), 2**32 - 1))
-            polarity = dr.select(~on & ~off & leaks, types.Int8(Origin.LEAK), polarity)
-        if self._noise.resets_hz > self._noise.leak_rate_hz:
-            # ON events of the comparators' noise take the lowest numbers of a random word, OFF events the highest
-            chances = [leak_probability(hz, (t_us - self._t_us) * S_PER_US) for hz in self._noise.comparator_noise_hz]
-            below, above = (dr.opaque(types.UInt32, min(round(p * 2**32), 2**32 - 1)) for p in chances)
-            own = dr.select(word[3] < below, types.Int8(1), dr.select(~word[3] < above, types.Int8(-1), types.Int8(0)))
-            polarity = dr.select(polarity == 0, own * types.Int8(Origin.COMPARATOR_NOISE), polarity)
-        begin_us = self._t_us
-        dr.schedule(polarity)
-        self._keep(level, variance, t_us)
-        result = polarity.numpy()
-        if self._defects is not None:
-            result = self._defects.at_tick(result, begin_us, t_us)
-        pixel = np.flatnonzero(result != 0)  # in row-major order
-        return _events(t_us, pixel, result[pixel], self._cols)
-
-    def _keep(self, level: Float, variance: Float, t_us: int) -> None:
-        import drjit as dr
-
-        self._t_us, self._level = t_us, level
-        if self._independent:
-            self._variance = variance
-            dr.schedule(variance)
-        dr.eval(self._level)
 
 
 class LastEvent:
@@ -212,11 +134,12 @@ class LastEvent:
         low_pass = self._photoreceptor
         if low_pass and low_pass.rests(log, t_us):
             low_pass = None
-        # between two nodes everything goes on straight lines, so that crossings have a closed form
-        for end_us in _nodes_us(t_us, self._band_noise, low_pass):
+        # between two nodes of the noise everything goes on straight lines, but for what the photoreceptor bends
+        for end_us in [*(self._band_noise.nodes_us(t_us) if self._band_noise else ()), float(t_us)]:
             part = dr.opaque(jit().Float, (end_us - self._t_us) / (t_us - self._t_us))
             # ln x on a line from sample to sample, then through the filter
             level = dr.fma(log - self._log, part, self._log)
+            bends_us, begin = low_pass.nodes_us(end_us) if low_pass else [], low_pass.now if low_pass else None
             if low_pass:
                 level = low_pass.to(level, end_us)
             if self._band_noise:
@@ -224,17 +147,20 @@ class LastEvent:
             if self._drift:
                 elapsed_us = end_us - self._t_us
                 level = level + self._drift.at(electrons, elapsed_us / (t_us - self._t_us), elapsed_us)
-            parts.append(self._crossings(level, begin_us, end_us))
+            if low_pass and begin and bends_us:
+                parts.append(self._crossings_on_curves(low_pass, begin, level, [begin_us, *bends_us, end_us]))
+            else:
+                parts.append(self._crossings(level, begin_us, end_us))
             begin_us = end_us
         beside: list[NDArray[np.void]] = []  # events that leave the reference as it is, which the drift must not count
         if not self._refractory:
             for origin, process in self._random.items():
                 into = beside if self._drift else parts
                 for due_us, pixel in process.until(t_us):
-                    into.append(_events(self._stamp(due_us), pixel, origin, self._cols))
+                    into.append(events_at(self._stamp(due_us), pixel, origin, self._cols))
         if self._defects and not self._refractory:
             own_us, pixel, polarity = self._defects.between(self._t_us, t_us)
-            parts.append(_events(self._stamp(own_us), pixel, polarity * Origin.DEFECT, self._cols))
+            parts.append(events_at(self._stamp(own_us), pixel, polarity * Origin.DEFECT, self._cols))
         events = np.concatenate(parts)
         if self._drift:
             events = events[np.argsort(events["t_us"], kind="stable")]
@@ -287,7 +213,7 @@ class LastEvent:
         # a crossing that rounding moved out of the previous segment is due at once
         part = (reference_0 + number * theta_signed - level_0) / np.where(travel == 0, np.inf, travel)
         t_us = begin_us + np.clip(part, 0.0, 1.0) * (end_us - begin_us)
-        return _events(self._stamp(t_us), np.repeat(result, repeats), np.sign(theta_signed), self._cols)
+        return events_at(self._stamp(t_us), np.repeat(result, repeats), np.sign(theta_signed), self._cols)
 
     def _crossings_with_dead_time(
         self, refractory: Refractory, level: Float, begin_us: float, end_us: float
@@ -301,8 +227,88 @@ class LastEvent:
         level : level at the end of the segment, one value per pixel.
         begin_us, end_us : bounds of the segment, µs.
         """
-        due = [(np.empty(0), np.empty(0, np.uint32))]
+        levels, thresholds = (self.level, level), self._noise.on_device.thresholds
+        self.reference, t_us, pixel, polarity = refractory.crossings(
+            self.reference, levels, thresholds, begin_us, end_us, self._due(begin_us, end_us)
+        )
+        self.level = level
+        return events_at(self._stamp(t_us), pixel, polarity, self._cols)
+
+    def _crossings_on_curves(
+        self, low_pass: Photoreceptor, begin: Instant, level: Float, nodes_us: list[float]
+    ) -> NDArray[np.void]:
+        """Events of one segment in which the photoreceptor bends the levels, unsorted.
+
+        Both poles are low-passes: until the end y stays between the least and the largest of its own begin, that of
+        the first pole, and the light at both ends. Only pixels that may come to a threshold within these bounds are
+        followed from node to node.
+
+        Parameters
+        ----------
+        low_pass : the photoreceptor, at the end.
+        begin : the photoreceptor at the begin.
+        level : level of each pixel at the end.
+        nodes_us : times of the begin, of the nodes and of the end, µs.
+        """
+        import drjit as dr
+
+        types, times_us = jit(), np.array(nodes_us)
+        due, end = self._due(nodes_us[0], nodes_us[-1]), low_pass.now
+        # noise and drift go on a line
+        first, last = self.level - (begin.log + begin.y), level - (end.log + end.y)
+        levels = begin.log, end.log, begin.log + begin.y, begin.log + begin.z
+        lowest, highest = dr.minimum(first, last), dr.maximum(first, last)
+        below = dr.minimum(dr.minimum(*levels[:2]), dr.minimum(*levels[2:])) + lowest - self.reference
+        above = dr.maximum(dr.maximum(*levels[:2]), dr.maximum(*levels[2:])) + highest - self.reference
+        on, off = (theta * (1 - _MARGIN_REL) for theta in self._noise.on_device.thresholds)
+        near = (above >= on) | (below <= -off)
+        if self._refractory:
+            near = self._refractory.may_fire(near, nodes_us[0], nodes_us[-1])
+        dr.eval(level, first, last, near)
+        before, self.level = self.level, level
+        every = np.union1d(np.flatnonzero(near.numpy()), due[1]).astype(np.uint32)
+        parts = [no_events()]
+        for pixel in np.split(every, range(_PATHS, every.size, _PATHS)) if every.size else ():
+            index = types.UInt32(pixel)
+            curve = low_pass.along(begin, end.log, index, times_us[1:])
+            theta = [take(values, index) for values in self._noise.on_device.thresholds]
+            gathered = [take(values, index) for values in (before, first, last, level, self.reference)]
+            dr.eval(curve, theta, gathered)
+            start, low, high, stop, own, on_host, off_host = (np.array(values) for values in (*gathered, *theta))
+            share = ((times_us[1:] - times_us[0]) / (times_us[-1] - times_us[0])).astype(np.float32)[:, None]
+            paths = np.concatenate([start[None], np.array(curve).reshape(-1, pixel.size) + low + share * (high - low)])
+            paths[-1] = stop
+            given = due if every.size == pixel.size else of_pixels(due, pixel)
+            reference, t_us, fired, polarity = self._on_paths(pixel, paths, times_us, own, (on_host, off_host), given)
+            dr.scatter(self.reference, types.Float(reference.astype(np.float32)), index)
+            parts.append(events_at(self._stamp(t_us), fired, polarity, self._cols))
+        dr.eval(self.reference)
+        return np.concatenate(parts)
+
+    def _on_paths(
+        self,
+        pixel: NDArray[np.uint32],
+        paths: NDArray[np.float32],
+        times_us: NDArray[np.float64],
+        reference: NDArray[np.float32],
+        thresholds: tuple[NDArray[np.float32], NDArray[np.float32]],
+        due: DueEvents,
+    ) -> tuple[NDArray[np.float64], NDArray, NDArray, NDArray]:
+        """New references of some pixels, and their events; see `events_on_paths`."""
+        own = reference.astype(np.float64)
+        on, off = (np.broadcast_to(theta, own.shape).astype(np.float64) for theta in thresholds)
+        if self._refractory:
+            return self._refractory.crossings_on_curves(pixel, paths, times_us, own, (on, off), due)
+        awake = np.full(own.size, LONG_AGO_US)
+        own, _, t_us, fired, polarity = events_on_paths(pixel, paths, times_us, own, (on, off), due, awake, None)
+        return own, t_us, fired, polarity
+
+    def _due(self, begin_us: float, end_us: float) -> DueEvents:
+        """Leak events, events of comparators and of defects of one segment, where pixels rest after them."""
+        due: list[Any] = [(np.empty(0), np.empty(0, np.uint32))]
         origins = [np.empty(0)]
+        if not self._refractory:
+            return *due[0], origins[0]  # they leave the reference as it is
         for origin, process in self._random.items():
             for part in process.until(end_us):
                 due.append(part)
@@ -310,11 +316,6 @@ class LastEvent:
         if self._defects:  # of asynchronous sensors they are ON events, as those of leak
             due.append(self._defects.between(begin_us, end_us)[:2])
             origins.append(np.full(len(due[-1][0]), Origin.DEFECT, np.float64))
-        due_us, due_pixel = (np.concatenate(values) for values in zip(*due, strict=True))
         # leaks and defects end or lengthen dead times, so that all events are taken together
-        levels, thresholds = (self.level, level), self._noise.on_device.thresholds
-        self.reference, t_us, pixel, polarity = refractory.crossings(
-            self.reference, levels, thresholds, begin_us, end_us, (due_us, due_pixel, np.concatenate(origins))
-        )
-        self.level = level
-        return _events(self._stamp(t_us), pixel, polarity, self._cols)
+        t_us, pixel = (np.concatenate(values) for values in zip(*due, strict=True))
+        return t_us, pixel, np.concatenate(origins)
