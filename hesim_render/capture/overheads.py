@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from hesim_render.core.units import S_PER_US
-from hesim_render.pixels.evs.photoreceptor import NODES_PER_CORNER_PERIOD
+from hesim_render.pixels.evs.processes import NODES_PER_CUTOFF_PERIOD
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.renderer import Demand, Estimate
 
@@ -15,10 +15,9 @@ from hesim_render.sources.renderer import Demand, Estimate
 _START_S = 1.0
 #: A window of the event pixels: planning and bookkeeping of the renderer, s.
 _WINDOW_S = 5e-3
-#: A step of the event stage, and a step of a photoreceptor that follows the light, of which a corner period has 32: s,
-#: and s for each event pixel.
+#: A step of the event stage, and a step of event pixels behind a photoreceptor: s, and s for each event pixel.
 _STEP_S, _STEP_PIXEL_S = 0.4e-3, 0.035e-6
-_NODE_S, _NODE_PIXEL_S = 0.9e-3, 0.02e-6
+_BENT_STEP_S, _BENT_STEP_PIXEL_S = 2.5e-3, 0.035e-6
 #: A frame, and a pixel of a frame, through noise and into its file, s.
 _FRAME_S, _FRAME_PIXEL_S = 2e-2, 60e-9
 #: Rays of an audit: a multiple of the run's own, and at most so many for pixels with a tick and for asynchronous ones,
@@ -55,7 +54,7 @@ def with_overheads(rays: Estimate, sensor: Sensor, demand: Demand, *, audited: b
 
 
 def noise_seconds(sensor: Sensor, duration_us: int, windows: float, *, rests: bool) -> float:
-    """Time of the event stage: its steps, and those of photoreceptors whose corner follows the light.
+    """Time of the event stage: its steps, from window to window and to each node of the noise.
 
     Parameters
     ----------
@@ -67,8 +66,8 @@ def noise_seconds(sensor: Sensor, duration_us: int, windows: float, *, rests: bo
         return 0.0
     pixels = sensor.layout.evs_pixel.size
     steps = max(windows, duration_us / evs.tick_us if evs.tick_us is not None else 0.0)
-    seconds = steps * (_STEP_S + _STEP_PIXEL_S * pixels)
-    if evs.photoreceptor is not None and evs.photoreceptor.follows_light and not rests:
-        nodes = NODES_PER_CORNER_PERIOD * evs.photoreceptor.cutoff_hz * duration_us * S_PER_US
-        seconds += nodes * (_NODE_S + _NODE_PIXEL_S * pixels)
-    return seconds
+    if evs.reference == "last_event" and evs.photoreceptor_cutoff_hz is not None:
+        steps += NODES_PER_CUTOFF_PERIOD * evs.photoreceptor_cutoff_hz * duration_us * S_PER_US
+    if evs.photoreceptor is not None and not rests:
+        return steps * (_BENT_STEP_S + _BENT_STEP_PIXEL_S * pixels)
+    return steps * (_STEP_S + _STEP_PIXEL_S * pixels)

@@ -26,14 +26,16 @@ def told(name, rays=RAYS, size=(64, 48), **changes):
     return found.seconds
 
 
-def test_a_photoreceptor_that_follows_the_light_takes_its_own_steps():
-    """32 of each period of its corner, however few windows there are."""
+def test_steps_go_to_windows_and_to_nodes_of_the_noise():
+    """16 nodes in each period of the noise, in still light as well; steps behind a photoreceptor cost more."""
     sensor = hr.load_sensor("imx636").crop(64, 48)
-    nodes = 32 * sensor.spec.evs.photoreceptor.cutoff_hz * 0.05
-    assert nodes > 10 * RUN["windows"]
+    steps = RUN["windows"] + 16 * sensor.spec.evs.photoreceptor_cutoff_hz * 0.05
+    plain, bent = 0.4e-3 + 0.035e-6 * 64 * 48, 2.5e-3 + 0.035e-6 * 64 * 48
     more = told("imx636") - told("imx636", rests=True) - RUN["windows"] * overheads._WINDOW_S
-    assert more == pytest.approx(nodes * (0.9e-3 + 0.02e-6 * 64 * 48), rel=1e-9)
-    assert noise_seconds(sensor, 50_000, 130.0, rests=True) == pytest.approx(130 * (0.4e-3 + 0.035e-6 * 64 * 48))
+    assert more == pytest.approx(steps * (bent - plain), rel=1e-9)
+    assert noise_seconds(sensor, 50_000, 130.0, rests=True) == pytest.approx(steps * plain)
+    davis = noise_seconds(hr.load_sensor("davis346").crop(64, 48), 50_000, 130.0, rests=False)
+    assert davis == pytest.approx((130 + 16 * 300 * 0.05) * plain)
     # ticks are steps, whatever is rendered
     assert noise_seconds(hr.load_sensor("eiger").crop(64, 48), 123_900, 0.0, rests=True) == pytest.approx(
         100 * (0.4e-3 + 0.035e-6 * 32 * 24)

@@ -83,6 +83,7 @@ def test_pixels_far_from_a_threshold_are_not_followed_and_lose_nothing(dead_us, 
     """All pixels followed, only those that need it, and these in small parts: the same events to the bit."""
     light = {"evs__leak": {"process": "drift", "rate_hz": 30.0}} if drift else {"evs__leak_rate_hz": 40.0}
     given = {key: value for key, value in NOISY.items() if key != "evs__leak_rate_hz"} | light
+    given["evs__contrast_threshold_on"] = 0.27 if dead_us else 0.2  # above and below θ₋
     noise = asynchronous(SIDE, evs__photoreceptor=FOLLOWING, evs__refractory_period_us=dead_us, **given)
     counted, along = [], Photoreceptor.along
     monkeypatch.setattr(Photoreceptor, "along", lambda self, *args: counted.append(len(args[2])) or along(self, *args))
