@@ -84,8 +84,8 @@ def import_(
         list[Path],
         typer.Argument(
             metavar="FILE...",
-            help="an event file (EVT2, EVT3 RAW, DAT, AEDAT4, HDF5 of DSEC or Prophesee, .npz, MCAP); with --sensor "
-            "also frames",
+            help="an event file (EVT2, EVT3 RAW, DAT, AEDAT4, HDF5 of DSEC or Prophesee, .npz, MCAP, text); with "
+            "--sensor also frames",
         ),
     ],
     out: Annotated[Path, typer.Option(help="HDF5 file to write; with --sensor the folder of the recording")],

@@ -76,7 +76,7 @@ def import_recording(
     stream = None if events is None else _events(events, sensor)
     if trigger_channel is not None and (stream is None or not frames):
         raise RangeError("trigger_channel", trigger_channel, "nothing, unless both events and frames are given")
-    end_us = 0 if stream is None else stream.span_us()[1]
+    spans = [] if stream is None else [_span_us(stream)]
     times: list[tuple[int, int]] = []
     if aps is not None and frames:
         if stream is not None and trigger_channel is not None:
@@ -86,9 +86,12 @@ def import_recording(
         else:
             starts = _starts_us(frames, aps.frame_rate_hz, aps.exposure_us)
             times = [(start, aps.exposure_us) for start in starts]
-        end_us = max(end_us, sum(times[-1]) + round((layout.rows - 1) * aps.line_time_us))
+        spans.append((times[0][0], sum(times[-1]) + round((layout.rows - 1) * aps.line_time_us)))
+    begin_us, end_us = min(begin for begin, _ in spans), max(end for _, end in spans)
     settings = {"imported": {"events": _name(events), "frames": [_name(file) for file in frames]}}
-    with RecordingWriter(path, sensor, seed=0, duration_us=end_us, settings=settings, overwrite=overwrite) as writer:
+    with RecordingWriter(
+        path, sensor, seed=0, begin_us=begin_us, duration_us=end_us - begin_us, settings=settings, overwrite=overwrite
+    ) as writer:
         valid = layout.aps_mask
         unknown = np.full(layout.shape, np.nan, dtype=np.float32)
         for index, (raw, (start_us, exposure_us)) in enumerate(zip(_frames(frames, sensor), times, strict=True)):
@@ -118,6 +121,14 @@ def _events(file: str | Path, sensor: Sensor) -> EventStream:
         problem = f"is of {cols}x{rows} px; the event grid of {sensor.spec.name} has {wanted_cols}x{wanted_rows}"
         raise SpecError(problem, file=file)
     return stream
+
+
+def _span_us(stream: EventStream) -> tuple[int, int]:
+    """Begin and end of the events, µs: the begin that the file states, or the whole ms before the first event, since
+    the clock of a camera may have run for long.
+    """
+    begin_us, end_us = stream.span_us()
+    return (max(0, begin_us - 1) // 1000 * 1000 if stream.interval_us is None else begin_us), end_us
 
 
 def _triggered(stream: EventStream, channel: int, count: int) -> list[tuple[int, int]]:

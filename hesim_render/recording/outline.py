@@ -22,10 +22,11 @@ def parameters(recording: Recorded) -> list[tuple[str, str]]:
     """What a recording holds, as pairs of a name and a text."""
     manifest = recording.manifest
     roi, grid, counts = manifest["roi"], manifest["event_grid"], manifest["counts"]
+    begin_us = manifest["time"]["begin_us"]
     rows = [
         ("scene", scene_name(recording)),
         ("sensor", manifest["sensor"]["name"]),
-        ("time", f"{recording.duration_us / US_PER_S:g} s"),
+        ("time", f"{recording.duration_us / US_PER_S:g} s" + (f" from {begin_us / US_PER_S} s on" if begin_us else "")),
         ("seed", str(manifest["seed"])),
         ("region", f"{roi['width_px']}×{roi['height_px']} px at column {roi['x']}, row {roi['y']}"),
     ]

@@ -63,8 +63,8 @@ def write_previews(recording: Recorded, folder: Path) -> list[Path]:
 
 
 def moves(recording: Recorded) -> bool:
-    """True if the scene of a recording has motion; a video always counts as moving."""
-    if "video" in recording.manifest["settings"]:
+    """True if the scene of a recording has motion; videos and captures of real sensors count as moving."""
+    if recording.manifest["settings"].keys() & {"video", "imported"}:
         return True
     scene = recording.manifest.get("scene") or {}
     return bool(scene.get("spec", {}).get("motion"))

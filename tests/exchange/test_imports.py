@@ -8,6 +8,7 @@ from test_bad_files import command
 
 from hesim_render.core.errors import HesimError
 from hesim_render.recording.imports import import_recording
+from hesim_render.recording.outline import parameters
 from hesim_render.recording.recording import Recording
 
 
@@ -146,3 +147,22 @@ def test_images_of_other_writers(tmp_path):
     with pytest.raises(HesimError, match="give no other files"):
         import_recording(tmp_path / "s", sensor, frames=[file_of(*messages), tmp_path / "x.png"])
     assert not (tmp_path / "s").exists()
+
+
+def test_a_recording_begins_where_its_events_do(tmp_path):
+    """The clock of a camera that has run for hours is no part of the recording; times stay those of the file."""
+    sensor = recordings.sensor_like("eiger")
+    first_us = 2 * 3600 * 1_000_000 + 3_000  # more than what 32 bits hold
+    events = made((first_us, 1, 2, 1), (first_us + 97_000, 3, 4, -1))
+    file = written(events, "evt3", tmp_path, sensor.layout.evs_shape)
+    recording = import_recording(tmp_path / "r", sensor, events=file)
+    assert recording.manifest["time"] == {"begin_us": first_us - 1000, "end_us": first_us + 97_000}
+    np.testing.assert_array_equal(recording.events["t_us"], [first_us, first_us + 97_000])
+    assert ("time", "0.098 s from 7200.002 s on") in parameters(recording)
+    assert (tmp_path / "r" / "events.h5").stat().st_size < 100_000  # its index does not begin at 0
+    ticks = recording.export("raw-npz", tmp_path / "ticks")
+    assert sum(np.abs(np.load(name)["events"]).sum() for name in ticks.glob("*_evs.npz")) == 2
+    # what is written from it is an event file of the same times
+    again = import_recording(tmp_path / "again", sensor, events=recording.export("dsec", tmp_path / "e.h5"))
+    assert again.manifest["time"] == recording.manifest["time"]
+    np.testing.assert_array_equal(again.events, recording.events)
