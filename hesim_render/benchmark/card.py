@@ -261,6 +261,8 @@ def croissant(manifest: dict[str, Any], manifest_text: str) -> str:
 def tasks(spec: dict[str, Any]) -> list[str]:
     """Names of hubs for tasks that a benchmark has truth for."""
     has = {*spec["truth"], *(["sharp"] if spec["sharp"] else [])}
+    if "ids" in has:
+        has.add("boxes")  # `Recording` makes them of the numbers of the objects
     if "all" in has:
         has |= set(_TASKS) - {"sharp"}
     return [task for name, task in _TASKS.items() if name in has]
