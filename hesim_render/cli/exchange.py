@@ -31,7 +31,7 @@ def export(
     format: Annotated[
         str,
         typer.Option(help="of events, such as evt3 or dsec; frames, such as tiff; both, such as mcap; geometric truth, "
-                     "such as exr or coco. A name that does not exist is answered with all (docs/formats.md)",
+                     "such as exr or coco. An unknown name prints them all (docs/formats.md)",
                      autocompletion=_complete_export),
     ],
     out: Annotated[Path, typer.Option(help="file of the events, or folder of the frames or of the truth")],

@@ -9,6 +9,7 @@ import numpy as np
 
 from hesim_render.core.guard import printable
 from hesim_render.core.html import inline_picture, table
+from hesim_render.core.progress import counted
 from hesim_render.core.units import US_PER_S
 
 if TYPE_CHECKING:
@@ -58,8 +59,7 @@ def text_summary(recording: Recorded) -> str:
     counts, roi, grid = (recording.manifest[key] for key in ("counts", "roi", "event_grid"))
     parts = [f"{recording.duration_us / US_PER_S:g} s"]
     if counts["frames"]:
-        noun = "frame" if counts["frames"] == 1 else "frames"
-        parts.append(f"{counts['frames']} {noun} of {roi['width_px']}x{roi['height_px']} px")
+        parts.append(f"{counted(counts['frames'], 'frame')} of {roi['width_px']}x{roi['height_px']} px")
     if grid["width"]:
         parts.append(f"{counts['events']} events on {grid['width']}x{grid['height']} px")
     if recording.path is not None:
