@@ -166,7 +166,7 @@ def design_verdict(verdict: Mapping[str, Any]) -> list[str]:
         if key in verdict:
             own, other = verdict[key], verdict[f"{key}_against"]
             if abs(own - other) > _EQUAL * abs(other):
-                (better if (own > other) == more_is_better else worse).append(f"{title} {own:.3g} after {other:.3g}")
+                (better if (own > other) == more_is_better else worse).append(f"{title} {own:.3g} against {other:.3g}")
     sentences = [f"The designed set {word} {verdict['against']} ({costs})."]
     sentences += [f"{name}: {', '.join(texts)}." for name, texts in (("Better", better), ("Worse", worse)) if texts]
     if verdict["clipped_lux"]:
