@@ -103,6 +103,10 @@ def import_(
         int | None,
         typer.Option(min=0, help="line of the event file whose triggers are the exposures of the frames"),
     ] = None,
+    from_zero: Annotated[
+        bool,
+        typer.Option("--from-zero", help="with --sensor: count times from its begin, not by the camera's clock"),
+    ] = False,
     overwrite: Overwrite = False,
     json_: Json = False,
     quiet: Quiet = False,
@@ -118,8 +122,9 @@ def import_(
     if sensor is None:
         from hesim_render.recording.exports import import_events
 
-        if len(sources) > 1 or roi is not None or trigger_channel is not None:
-            raise ConflictError("FILE", len(sources), "more than one file, --roi or --trigger-channel needs --sensor")
+        if len(sources) > 1 or roi is not None or trigger_channel is not None or from_zero:
+            problem = "more than one file, --roi, --trigger-channel or --from-zero needs --sensor"
+            raise ConflictError("FILE", len(sources), problem)
         shape = None if size is None else parse_size(size)
         written = import_events(sources[0], out, format=format, shape=shape, overwrite=overwrite)
         stream = open_events(written)
@@ -146,6 +151,6 @@ def import_(
     loaded = cropped(hr.load_sensor(sensor), roi)
     made = import_recording(
         out, loaded, events=events[0] if events else None, frames=frames, trigger_channel=trigger_channel,
-        overwrite=overwrite,
+        from_zero=from_zero, overwrite=overwrite,
     )  # fmt: skip
     show_recording(console, made)

@@ -31,6 +31,7 @@ def import_recording(
     events: str | Path | None = None,
     frames: Sequence[str | Path] = (),
     trigger_channel: int | None = None,
+    from_zero: bool = False,
     overwrite: bool = False,
 ) -> Recording:
     """Write a capture as a recording, for the ISP and the viewers. Its truth is unknown: the maps of frames are NaN.
@@ -48,6 +49,7 @@ def import_recording(
     trigger_channel : line of the event file whose triggers are the exposures of the frames' first rows: a rising edge
         at the begin and a falling one at the end of each, so that frames and events have one clock. None: the times
         above.
+    from_zero : count times from the begin of the recording, not by the camera's clock, which may be the time of day.
     overwrite : replace an existing recording.
 
     Returns
@@ -88,14 +90,17 @@ def import_recording(
             times = [(start, aps.exposure_us) for start in starts]
         spans.append((times[0][0], sum(times[-1]) + round((layout.rows - 1) * aps.line_time_us)))
     begin_us, end_us = min(begin for begin, _ in spans), max(end for _, end in spans)
+    zero_us = begin_us if from_zero else 0
     settings = {"imported": {"events": _name(events), "frames": [_name(file) for file in frames]}}
     with RecordingWriter(
-        path, sensor, seed=0, begin_us=begin_us, duration_us=end_us - begin_us, settings=settings, overwrite=overwrite
-    ) as writer:
+        path, sensor, seed=0, begin_us=begin_us - zero_us, duration_us=end_us - begin_us, settings=settings,
+        overwrite=overwrite,
+    ) as writer:  # fmt: skip
         valid = layout.aps_mask
         unknown = np.full(layout.shape, np.nan, dtype=np.float32)
         for index, (raw, (start_us, exposure_us)) in enumerate(zip(_frames(frames, sensor), times, strict=True)):
             assert aps is not None
+            start_us -= zero_us
             writer.add_frame(
                 Frame(
                     raw=np.where(valid, raw, 0).astype(np.uint16), valid=valid, electrons_mean=unknown,
@@ -104,6 +109,9 @@ def import_recording(
                 )
             )  # fmt: skip
         for block in stream or ():
+            if zero_us:
+                block = block.copy()
+                block["t_us"] -= zero_us
             writer.add_events(block)
         return writer.finish()
 
