@@ -23,6 +23,12 @@ INDEXED = re.compile(r"(?<![\w/.:])([A-Za-zΔΘΛΣΦΨΩαβγδηθκλμνρ�
 LONG_CELL = 40
 #: Letters of a word that is a key: the column beside it would be too narrow on a telephone.
 LONG_WORD = 18
+#: A word of code with a hyphen, at which a browser would cut it.
+SHORT_HYPHENED = re.compile(r"(?<![^ ])(?=[^ ]*-)[^ ]{2,%d}(?![^ ])" % LONG_WORD)
+#: The same in a block of commands, between what marks the spaces.
+OPTION = re.compile(r"(?<=[\s>])(?=[\w-]*-)[\w-]{2,24}(?=[\s<])")
+#: A match that is not cut at the end of a line.
+WHOLE = r"<span class=whole>\g<0></span>"
 #: Where docs/cli.md is to have what `--help-all` says of each command.
 COMMANDS = "<!-- commands -->"
 
@@ -98,7 +104,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Fold the tests of equations; name cells of tables with long text by their heads, for narrow screens."""
+    """Fold the tests of equations; for narrow screens, name cells of tables with long text, keep short code whole."""
 
     def named(table: re.Match) -> str:
         heads = [plain_text(head) for head in re.findall(r"<th[^>]*>(.*?)</th>", table.group(0), re.DOTALL)]
@@ -114,7 +120,18 @@ def on_page_content(html: str, **_: Any) -> str:
 
     folded = r"<details class=tests><summary>Checked by tests</summary>\1</details>"
     html = re.sub(r"<p><em>Checked by</em> (.*?)</p>", folded, html, flags=re.DOTALL)
-    return re.sub(r"<table>.*?</table>", named, html, flags=re.DOTALL)
+    html = re.sub(r"<table>.*?</table>", named, html, flags=re.DOTALL)
+    html = re.sub(r"<code>([^<>\n]+)</code>", whole_words, html)
+    options = lambda block: OPTION.sub(WHOLE, block.group(0))  # noqa: E731
+    return re.sub(r'<div class="language-bash.*?</div>', options, html, flags=re.DOTALL)
+
+
+def whole_words(code: re.Match) -> str:
+    """Code in a line of text whose short words are not cut: neither ``--roi`` at its hyphens nor a name in a table."""
+    text = code.group(1)
+    if len(text) <= LONG_WORD:
+        return f"<code class=whole>{text}</code>"
+    return "<code>" + SHORT_HYPHENED.sub(WHOLE, text) + "</code>"
 
 
 def plain_text(html: str) -> str:
@@ -158,8 +175,9 @@ def commands() -> str:
     from hesim_render.cli.options import full_help
 
     def section(name: str, command: Any) -> list[str]:
+        width = 90  # as many letters as fit beside the table of contents
         context = command.context_class(
-            command, info_name=f"hesim-render {name}", terminal_width=100, max_content_width=100
+            command, info_name=f"hesim-render {name}", terminal_width=width, max_content_width=width
         )
         lines = [f"### {name}", "", "```text", full_help(context).strip(), "```", ""]
         for below, child in getattr(command, "commands", {}).items():

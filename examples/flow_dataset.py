@@ -22,7 +22,7 @@ SCENES = ("camera-sweep", "facade-drive")
 
 
 def clips(name):
-    sensor = hr.load_sensor("gen2").crop(COLS, COLS * 3 // 4)
+    sensor = hr.load_sensor("gen2", {"aps.exposure_us": 1000}).crop(COLS, COLS * 3 // 4)
     rec = hr.simulate(hr.load_scene(name), sensor, duration_s=CLIPS * SPAN_US * 1e-6, seed=1, quality=2)
     for k in range(CLIPS):
         begin = k * SPAN_US

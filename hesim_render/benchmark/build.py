@@ -21,7 +21,7 @@ from hesim_render.benchmark.worker import attempt, order_of
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
 from hesim_render.core.guard import WholeFile
 from hesim_render.core.output import check_target, output_errors, replacing
-from hesim_render.core.progress import Progress, in_words
+from hesim_render.core.progress import Progress, counted, in_words
 from hesim_render.specs.benchmark import BenchmarkSpec, read_benchmark
 from hesim_render.specs.files import content_hash
 
@@ -144,8 +144,8 @@ def last_run(root: Path) -> str:
     run = WholeFile(root / REPORT_FILE).json()[-1]
     if not run["clips"]:
         return "all clips were there"
-    text = f"{run['clips']} clips in {in_words(run['seconds'])}, {3600 * run['clips'] / run['seconds']:.0f} clips/h"
-    text += f", {run['bytes'] / 1e9:.3g} GB"
+    text = f"{counted(run['clips'], 'clip')} in {in_words(run['seconds'])}, "
+    text += f"{3600 * run['clips'] / run['seconds']:.0f} clips/h, {run['bytes'] / 1e9:.3g} GB"
     if run["expected"] is not None:
         seconds, size = run["expected"]["seconds"], run["expected"]["bytes"]
         text += f" (estimate: {in_words(seconds)} of one worker, {size / 1e9:.2g} GB)"

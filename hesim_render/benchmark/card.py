@@ -20,6 +20,7 @@ import numpy as np
 
 from hesim_render.benchmark.statistics import FIGURES
 from hesim_render.core.guard import printable
+from hesim_render.core.progress import counted
 from hesim_render.specs.benchmark import SPLITS
 
 HISTOGRAM_FILE = "histograms.png"
@@ -88,7 +89,7 @@ def card(manifest: dict[str, Any], clips: list[dict[str, Any]]) -> str:
     kinds = _escaped(", ".join(spec["truth"])) or "none"
     lines = [
         f"# {_escaped(manifest['name'])}", "", _escaped(spec["description"]), "",
-        f"{len(clips)} clips of {spec['duration_s']:g} s, {size / 1e9:.3g} GB, rendered by hesim_render "
+        f"{counted(len(clips), 'clip')} of {spec['duration_s']:g} s, {size / 1e9:.3g} GB, rendered by hesim_render "
         f"{manifest['versions']['hesim_render']}. Every number can be made again from `plan.json`; "
         "`hesim-render benchmark verify` compares all files with their SHA-256.", "",
         "| Split | Clips | Scenes |", "|---|---|---|",
@@ -261,6 +262,8 @@ def croissant(manifest: dict[str, Any], manifest_text: str) -> str:
 def tasks(spec: dict[str, Any]) -> list[str]:
     """Names of hubs for tasks that a benchmark has truth for."""
     has = {*spec["truth"], *(["sharp"] if spec["sharp"] else [])}
+    if "ids" in has:
+        has.add("boxes")  # `Recording` makes them of the numbers of the objects
     if "all" in has:
         has |= set(_TASKS) - {"sharp"}
     return [task for name, task in _TASKS.items() if name in has]

@@ -40,12 +40,12 @@ _WHY = {
     "errors everywhere",
     "interpolate": "doing nothing has {nothing:.3g} dB because little changes from frame to frame, and a method adds "
     "errors everywhere",
-    "denoise": "F1 of {nothing:.3g} without a filter says that many events are signal, of which a filter drops more "
-    "than it gains by the noise that it drops",
-    "fidelity": "the events are {nothing:.3g} px from the true ones without a filter, and signal that a filter drops "
-    "moves them away",
-    "flow": "pixels move by {nothing:.3g} px in the mean, which is the error of zero; a method is wrong also where "
-    "nothing moves",
+    "denoise": "F1 is {nothing:.3g} without a filter: so many events are signal that a filter drops more of them than "
+    "of the noise",
+    "fidelity": "without a filter the events are {nothing:.3g} px from the true ones; true events that a filter drops "
+    "make this distance larger",
+    "flow": "pixels move by {nothing:.3g} px in the mean, so a flow of zero is off by no more; a method has errors "
+    "also where nothing moves",
     "hdr": "the shortest exposure has {nothing:.3g} dB; what moves between exposures leaves ghosts in a merge",
 }
 #: Methods that count a threshold for each event.

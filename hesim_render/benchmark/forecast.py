@@ -14,7 +14,7 @@ from hesim_render.capture.loop import Capture
 from hesim_render.capture.overheads import noise_seconds
 from hesim_render.capture.run_settings import noise_models
 from hesim_render.capture.scene_renderer import scene_renderer
-from hesim_render.core.progress import Progress, in_words
+from hesim_render.core.progress import Progress, counted, in_words
 from hesim_render.mosaic.schedule import Exposure
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.light_level import in_absolute_light
@@ -51,7 +51,7 @@ class BuildEstimate:
     bytes: float
 
     def __str__(self) -> str:
-        return f"{self.clips} clips, about {in_words(self.seconds)} of one worker, {self.bytes / 1e9:.2g} GB"
+        return f"{counted(self.clips, 'clip')}, about {in_words(self.seconds)} of one worker, {self.bytes / 1e9:.2g} GB"
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)

@@ -39,8 +39,11 @@ def summary_lines(calibration: Mapping[str, Any], section: str) -> list[str]:
     content = calibration[section]
     names = _APS if section == "aps" else _EVS
     truth = (calibration.get("capture", {}).get("truth") or {}).get(section, {})
-    lines = [_line(text, content[key]) + _beside(content[key], truth.get(key)) for key, text in names.items()
-             if key in content]  # fmt: skip
+    lines = [
+        "; ".join(filter(None, (_line(text, content[key]), beside(content[key], truth.get(key)))))
+        for key, text in names.items()
+        if key in content
+    ]
     lines += [_line(f"noise at {item['signal_dn']:.4g} DN", item) for item in content.get("noise", [])]
     if section == "aps":
         values = [c for row in content["goodness"]["chi2_per_dof"] for c in row if c is not None]
@@ -59,13 +62,14 @@ def _line(text: str, item: Mapping[str, Any]) -> str:
         return f"{text:<20} not identifiable: {item['reason']}"
     interval = item.get("interval_95")
     between = f" ({interval[0]:.5g} to {interval[1]:.5g})" if interval else ""
-    return " ".join([f"{text:<20} {item['value']:.5g}{between}", item.get("unit", ""), item.get("note", "")]).rstrip()
+    value = f"{text:<20} {item['value']:.5g}{between} {item.get('unit', '')}".rstrip()
+    return f"{value}; {item['note']}" if item.get("note") else value
 
 
-def _beside(item: Mapping[str, Any], truth: float | None) -> str:
-    """The truth beside an estimate; one of twenty lies outside of a 95 % interval."""
+def beside(item: Mapping[str, Any], truth: float | None) -> str:
+    """The truth for a place beside an estimate; one of twenty lies outside of a 95 % interval."""
     if truth is None:
         return ""
     interval = item.get("interval_95")
     is_outside = interval is not None and not interval[0] <= truth <= interval[1]
-    return f"; truth {truth:.5g}{' (outside)' if is_outside else ''}"
+    return f"truth {truth:.5g}{' (outside)' if is_outside else ''}"

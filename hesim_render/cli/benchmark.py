@@ -13,6 +13,7 @@ from hesim_render.cli.options import LONG_MINUTES, HelpAll, Overwrite, Yes, list
 from hesim_render.cli.terminal import complain
 from hesim_render.core.errors import RangeError, TooLongError, did_you_mean
 from hesim_render.core.output import free_place
+from hesim_render.core.progress import counted
 
 if TYPE_CHECKING:
     from hesim_render.benchmark.forecast import BuildEstimate
@@ -62,7 +63,7 @@ def build(
     if dry_run:
         with console.progress(content.name) as progress:
             total, missing, expected = check_build(content, out, progress)
-        text = f"{total} clips, {len(missing)} of them not yet built; nothing was written (--dry-run)"
+        text = f"{counted(total, 'clip')}, {len(missing)} not yet built; nothing was written (--dry-run)"
         console.text("" if expected is None else f"estimate: {expected}")
         facts = {"dry_run": True, "clips": total, "missing": len(missing), "estimate": expected and facts_of(expected)}
         console.result(text, facts)
@@ -76,7 +77,7 @@ def build(
     clips = built.manifest["clips"]
     count = {split: sum(c["split"] == split for c in clips) for split in ("train", "val", "test")}
     splits = ", ".join(f"{number} {split}" for split, number in count.items())
-    text = f"{len(clips)} clips ({splits})\n  {last_run(built.root)}\n  in {built.root}\n"
+    text = f"{counted(len(clips), 'clip')} ({splits})\n  {last_run(built.root)}\n  in {built.root}\n"
     card = built.root / "README.md"
     audits = {clip.name: clip.content["render"].get("audit") for clip in built.clips()}
     short = [name for name, audit in audits.items() if is_short_of_wish(audit)]
@@ -123,12 +124,12 @@ def verify(
     if problems:
         complain(*problems)
         removed = discard_damaged(folder, problems) if discard else []
-        text = f"removed {len(removed)} clips; 'benchmark build' makes them again" if discard else ""
+        text = f"removed {counted(len(removed), 'clip')}; 'benchmark build' makes them again" if discard else ""
         console.result(text, {"problems": problems, "removed": removed}, ExitStatus.DIFFERENT)
     benchmark = Benchmark(folder)
     count, digest = len(benchmark.manifest["clips"]), digest_of(benchmark)
     facts = {"problems": [], "clips": count, "digest": digest}
-    console.result(f"{count} clips are as they were built; digest {digest}", facts)
+    console.result(f"{counted(count, 'clip')} as built; digest {digest}", facts)
 
 
 @app.command()
@@ -166,7 +167,7 @@ def evaluate(
             folder, split=None if split == "all" else split, tasks=listed(tasks), predictions=predictions, out=out,
             progress=progress,
         )  # fmt: skip
-    lines = [f"{result['clips']} clips of {result['benchmark']}, split {result['split']}"]
+    lines = [f"{counted(result['clips'], 'clip')} of {result['benchmark']}, split {result['split']}"]
     lines += [score_table(result["summary"]) or "no clip has what these tasks need", *result["verdicts"]]
     lines += [] if out is None else [f"in {out}"]
     for name in listed(tasks):

@@ -31,7 +31,7 @@ def export(
     format: Annotated[
         str,
         typer.Option(help="of events, such as evt3 or dsec; frames, such as tiff; both, such as mcap; geometric truth, "
-                     "such as exr or coco. A name that does not exist is answered with all (docs/formats.md)",
+                     "such as exr or coco. An unknown name prints them all (docs/formats.md)",
                      autocompletion=_complete_export),
     ],
     out: Annotated[Path, typer.Option(help="file of the events, or folder of the frames or of the truth")],
@@ -84,8 +84,8 @@ def import_(
         list[Path],
         typer.Argument(
             metavar="FILE...",
-            help="an event file (EVT2, EVT3 RAW, DAT, AEDAT4, HDF5 of DSEC or Prophesee, .npz, MCAP); with --sensor "
-            "also frames",
+            help="an event file (EVT2, EVT3 RAW, DAT, AEDAT4, HDF5 of DSEC or Prophesee, .npz, MCAP, text); with "
+            "--sensor also frames",
         ),
     ],
     out: Annotated[Path, typer.Option(help="HDF5 file to write; with --sensor the folder of the recording")],
@@ -103,6 +103,10 @@ def import_(
         int | None,
         typer.Option(min=0, help="line of the event file whose triggers are the exposures of the frames"),
     ] = None,
+    from_zero: Annotated[
+        bool,
+        typer.Option("--from-zero", help="with --sensor: count times from its begin, not by the camera's clock"),
+    ] = False,
     overwrite: Overwrite = False,
     json_: Json = False,
     quiet: Quiet = False,
@@ -118,8 +122,9 @@ def import_(
     if sensor is None:
         from hesim_render.recording.exports import import_events
 
-        if len(sources) > 1 or roi is not None or trigger_channel is not None:
-            raise ConflictError("FILE", len(sources), "more than one file, --roi or --trigger-channel needs --sensor")
+        if len(sources) > 1 or roi is not None or trigger_channel is not None or from_zero:
+            problem = "more than one file, --roi, --trigger-channel or --from-zero needs --sensor"
+            raise ConflictError("FILE", len(sources), problem)
         shape = None if size is None else parse_size(size)
         written = import_events(sources[0], out, format=format, shape=shape, overwrite=overwrite)
         stream = open_events(written)
@@ -146,6 +151,6 @@ def import_(
     loaded = cropped(hr.load_sensor(sensor), roi)
     made = import_recording(
         out, loaded, events=events[0] if events else None, frames=frames, trigger_channel=trigger_channel,
-        overwrite=overwrite,
+        from_zero=from_zero, overwrite=overwrite,
     )  # fmt: skip
     show_recording(console, made)

@@ -23,6 +23,20 @@ from hesim_render.core.shipped import list_names
 _SENSOR_KEYS = ("geometry", "tile", "pixels", "evs_grid")
 #: Words beside the kinds and the sensors.
 _MACHINE, _NAMES = "machine", "names"
+#: What the kinds of ground truth are.
+_TRUTH = {
+    "depth": "distance along the axis, and from the entrance pupil, m",
+    "normals": "normal of the surface, in axes of the world",
+    "position": "point of the surface in the world, m",
+    "ids": "numbers of object, instance and material; boxes and masks follow from them",
+    "flow": "displacement to the next and the previous time, px, and what stays visible",
+    "mixed": "pixels that show more than one surface",
+    "poses": "of camera and objects, every ms",
+    "boxes": "around visible pixels and whole objects, and in space",
+    "imu": "angular rate and acceleration at the camera",
+    "light": "level of each light, every ms",
+    "events": "cause and object of each event, lost events, and the events without noise",
+}
 
 
 class Kind(StrEnum):
@@ -163,7 +177,7 @@ def _rows_of(kind: Kind) -> list[dict[str, Any]]:
     if kind is Kind.truth:
         from hesim_render.recording.truth_file import TRUTH_KINDS
 
-        return [{"name": name} for name in TRUTH_KINDS]
+        return [{"name": name, "description": _TRUTH[name]} for name in TRUTH_KINDS]
     from hesim_render.core.shipped import data_folder, read_keys
 
     keys = ("description", *(_SENSOR_KEYS if kind is Kind.sensors else ()))

@@ -110,6 +110,11 @@ def in_words(seconds: float) -> str:
     return f"{seconds / 86400:.1f} days" if seconds < 1e7 * 86400 else f"{seconds / 86400 / 365.25:.1g} years"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number with its noun: ``1 clip``, ``2 clips``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 class _View:
     """Display of the pace; this one shows nothing."""
 

@@ -170,7 +170,10 @@ def table_lines(figures: dict[str, list[Row]]) -> Iterable[str]:
 
 
 def _short(value: float) -> str:
-    """Four figures; rates that nobody will see as 0."""
+    """Four figures, or a whole number as it is, without an exponent; rates that nobody will see as 0."""
     if 0 < abs(value) < 1e-6:
         return "0"
-    return f"{value:.4g}" if abs(value) < 1e5 or value != round(value) else f"{value:.0f}"
+    four = f"{value:.4g}"
+    if not 1e3 <= abs(value) < 1e12:  # nor NaN
+        return four
+    return f"{value if value == round(value) else float(four):.0f}"

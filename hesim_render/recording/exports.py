@@ -247,7 +247,10 @@ def write_tick_files(recording: Recorded, folder: Path, tick_us: int | None) -> 
         np.savez_compressed(folder / f"{frame.t_us:09d}_aps_raw.npz", raw=frame.raw, aps_raw=frame.raw)
     if tick_us is None:
         return len(recording.frames)
-    for tick in range(tick_us, recording.duration_us + 1, tick_us):
+    begin_us, end_us = (recording.manifest["time"][name] for name in ("begin_us", "end_us"))
+    if recording.event_slice(end_us // tick_us * tick_us + 1, end_us + 1).size:  # a camera's, within a tick
+        end_us += tick_us
+    for tick in range((begin_us // tick_us + 1) * tick_us, end_us + 1, tick_us):
         result = recording.event_slice(tick - tick_us + 1, tick + 1)
         signs = np.zeros(recording.event_shape, np.int8)
         signs[result["y"], result["x"]] = result["polarity"]

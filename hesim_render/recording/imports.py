@@ -31,6 +31,7 @@ def import_recording(
     events: str | Path | None = None,
     frames: Sequence[str | Path] = (),
     trigger_channel: int | None = None,
+    from_zero: bool = False,
     overwrite: bool = False,
 ) -> Recording:
     """Write a capture as a recording, for the ISP and the viewers. Its truth is unknown: the maps of frames are NaN.
@@ -48,6 +49,7 @@ def import_recording(
     trigger_channel : line of the event file whose triggers are the exposures of the frames' first rows: a rising edge
         at the begin and a falling one at the end of each, so that frames and events have one clock. None: the times
         above.
+    from_zero : count times from the begin of the recording, not by the camera's clock, which may be the time of day.
     overwrite : replace an existing recording.
 
     Returns
@@ -76,7 +78,7 @@ def import_recording(
     stream = None if events is None else _events(events, sensor)
     if trigger_channel is not None and (stream is None or not frames):
         raise RangeError("trigger_channel", trigger_channel, "nothing, unless both events and frames are given")
-    end_us = 0 if stream is None else stream.span_us()[1]
+    spans = [] if stream is None else [_span_us(stream)]
     times: list[tuple[int, int]] = []
     if aps is not None and frames:
         if stream is not None and trigger_channel is not None:
@@ -86,13 +88,19 @@ def import_recording(
         else:
             starts = _starts_us(frames, aps.frame_rate_hz, aps.exposure_us)
             times = [(start, aps.exposure_us) for start in starts]
-        end_us = max(end_us, sum(times[-1]) + round((layout.rows - 1) * aps.line_time_us))
+        spans.append((times[0][0], sum(times[-1]) + round((layout.rows - 1) * aps.line_time_us)))
+    begin_us, end_us = min(begin for begin, _ in spans), max(end for _, end in spans)
+    zero_us = begin_us if from_zero else 0
     settings = {"imported": {"events": _name(events), "frames": [_name(file) for file in frames]}}
-    with RecordingWriter(path, sensor, seed=0, duration_us=end_us, settings=settings, overwrite=overwrite) as writer:
+    with RecordingWriter(
+        path, sensor, seed=0, begin_us=begin_us - zero_us, duration_us=end_us - begin_us, settings=settings,
+        overwrite=overwrite,
+    ) as writer:  # fmt: skip
         valid = layout.aps_mask
         unknown = np.full(layout.shape, np.nan, dtype=np.float32)
         for index, (raw, (start_us, exposure_us)) in enumerate(zip(_frames(frames, sensor), times, strict=True)):
             assert aps is not None
+            start_us -= zero_us
             writer.add_frame(
                 Frame(
                     raw=np.where(valid, raw, 0).astype(np.uint16), valid=valid, electrons_mean=unknown,
@@ -101,6 +109,9 @@ def import_recording(
                 )
             )  # fmt: skip
         for block in stream or ():
+            if zero_us:
+                block = block.copy()
+                block["t_us"] -= zero_us
             writer.add_events(block)
         return writer.finish()
 
@@ -118,6 +129,14 @@ def _events(file: str | Path, sensor: Sensor) -> EventStream:
         problem = f"is of {cols}x{rows} px; the event grid of {sensor.spec.name} has {wanted_cols}x{wanted_rows}"
         raise SpecError(problem, file=file)
     return stream
+
+
+def _span_us(stream: EventStream) -> tuple[int, int]:
+    """Begin and end of the events, µs: the begin that the file states, or the whole ms before the first event, since
+    the clock of a camera may have run for long.
+    """
+    begin_us, end_us = stream.span_us()
+    return (max(0, begin_us - 1) // 1000 * 1000 if stream.interval_us is None else begin_us), end_us
 
 
 def _triggered(stream: EventStream, channel: int, count: int) -> list[tuple[int, int]]:

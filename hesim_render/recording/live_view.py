@@ -38,7 +38,7 @@ def live_file(folder: Path | None) -> Path | None:
     RangeError
         If there is neither a display nor a folder.
     """
-    viewer_module(folder)
+    viewer_module()
     if rerun_view.can_show():
         return None
     if folder is None:
@@ -64,7 +64,7 @@ class LiveView:
     """
 
     def __init__(self, manifest: Mapping[str, Any], path: Path | None) -> None:
-        self._stream = viewer_module(path).RecordingStream("hesim_render")
+        self._stream = viewer_module().RecordingStream("hesim_render")
         send_to(self._stream, path)
         self._mosaic = Mosaic.model_validate(manifest["mosaic"])
         grid, time = manifest["event_grid"], manifest["time"]

@@ -56,6 +56,7 @@ def build(
     seed: int,
     duration_us: int,
     settings: Mapping[str, Any],
+    begin_us: int = 0,
 ) -> dict[str, Any]:
     """The manifest of a new recording; frames and counts are added as it grows."""
     layout, spec = sensor.layout, sensor.spec
@@ -72,7 +73,7 @@ def build(
         "software": software_versions(),
         "seed": seed,
         "settings": dict(settings),
-        "time": {"begin_us": 0, "end_us": duration_us},
+        "time": {"begin_us": begin_us, "end_us": begin_us + duration_us},
         "roi": {"x": layout.col0, "y": layout.row0, "width_px": layout.cols, "height_px": layout.rows},
         "event_grid": {"width": layout.evs_shape[1], "height": layout.evs_shape[0]},
         "mosaic": described.model_dump(mode="json"),

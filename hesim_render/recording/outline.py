@@ -9,6 +9,7 @@ import numpy as np
 
 from hesim_render.core.guard import printable
 from hesim_render.core.html import inline_picture, table
+from hesim_render.core.progress import counted
 from hesim_render.core.units import US_PER_S
 
 if TYPE_CHECKING:
@@ -22,10 +23,11 @@ def parameters(recording: Recorded) -> list[tuple[str, str]]:
     """What a recording holds, as pairs of a name and a text."""
     manifest = recording.manifest
     roi, grid, counts = manifest["roi"], manifest["event_grid"], manifest["counts"]
+    begin_us = manifest["time"]["begin_us"]
     rows = [
         ("scene", scene_name(recording)),
         ("sensor", manifest["sensor"]["name"]),
-        ("time", f"{recording.duration_us / US_PER_S:g} s"),
+        ("time", f"{recording.duration_us / US_PER_S:g} s" + (f" from {begin_us / US_PER_S} s on" if begin_us else "")),
         ("seed", str(manifest["seed"])),
         ("region", f"{roi['width_px']}×{roi['height_px']} px at column {roi['x']}, row {roi['y']}"),
     ]
@@ -57,8 +59,7 @@ def text_summary(recording: Recorded) -> str:
     counts, roi, grid = (recording.manifest[key] for key in ("counts", "roi", "event_grid"))
     parts = [f"{recording.duration_us / US_PER_S:g} s"]
     if counts["frames"]:
-        noun = "frame" if counts["frames"] == 1 else "frames"
-        parts.append(f"{counts['frames']} {noun} of {roi['width_px']}x{roi['height_px']} px")
+        parts.append(f"{counted(counts['frames'], 'frame')} of {roi['width_px']}x{roi['height_px']} px")
     if grid["width"]:
         parts.append(f"{counts['events']} events on {grid['width']}x{grid['height']} px")
     if recording.path is not None:

@@ -76,9 +76,11 @@ def draw_rates(recording: Recorded, axes: Axes) -> None:
         for a, b in zip(edges[:-1], edges[1:], strict=True)
     ]
     on, off = (np.array([getattr(rate, name)[0] for rate in rates]) for name in ("on_per_s", "off_per_s"))
-    axes.stairs(on, edges / US_PER_S, color=COLOURS[1], label="ON")
-    axes.stairs(off, edges / US_PER_S, color=COLOURS[0], label="OFF")
-    axes.set(title="Events", xlabel="time, s", ylabel="events per s, all pixels")
+    edges_s = (edges - time["begin_us"]) / US_PER_S
+    axes.stairs(on, edges_s, color=COLOURS[1], label="ON")
+    axes.stairs(off, edges_s, color=COLOURS[0], label="OFF")
+    begin = f" after {time['begin_us'] / US_PER_S} s" if time["begin_us"] else ""
+    axes.set(title="Events", xlabel=f"time, s{begin}", ylabel="events per s, all pixels")
     axes.set_ylim(bottom=0)
     axes.legend(frameon=False)
 

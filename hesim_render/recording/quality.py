@@ -32,8 +32,8 @@ def render_lines(render: dict[str, Any] | None) -> list[str]:
         if part is not None:
             lines.append(
                 f"audit, {name}: true deviation rms {_short(part['deviation_noise']['rms'])}; "
-                f"{_percent(part['off'])} of values are off by more than {audit['tolerance_noise']:g} of the noise, "
-                f"with 99 % confidence at most {_percent(part['off_at_most'])}{_events(part)}"
+                f"{_percent(part['off'])} of values are off by more than {audit['tolerance_noise']:g} times the noise "
+                f"(with 99 % confidence at most {_percent(part['off_at_most'])}){_events(part)}"
             )
     return lines + _verdict(audit)
 
@@ -79,13 +79,13 @@ def _events(part: dict[str, Any]) -> str:
         return ""
     if _saw_too_little(part):
         none = part["missed"] == part["extra"] == 0
-        verdict = "none was missed and none is too many" if none else (
-            f"{_percent(part['missed'])} are missed, {_percent(part['extra'])} too many"
+        verdict = "none was missed and none was extra" if none else (
+            f"{_percent(part['missed'])} are missed, {_percent(part['extra'])} extra"
         )  # fmt: skip
-        return f"; of {max(true or 0, result or 0):.0f} signal events that were seen {verdict}, too few for a bound"
+        return f"; of {max(true or 0, result or 0):.0f} signal events that were seen {verdict} (too few for a bound)"
     return (
-        f"; missed {_percent(part['missed'])} of signal events, at most {_percent(part['missed_at_most'])}; "
-        f"too many {_percent(part['extra'])}, at most {_percent(part['extra_at_most'])}"
+        f"; of signal events {_percent(part['missed'])} missed (at most {_percent(part['missed_at_most'])}), "
+        f"{_percent(part['extra'])} extra (at most {_percent(part['extra_at_most'])})"
     )
 
 
@@ -104,12 +104,12 @@ def _verdict(audit: dict[str, Any]) -> list[str]:
             off = max(audit.get(f"{name}_off", 0.0) for name in ("events", "frames"))
             return [
                 f"NOT MET: by their stated error {_percent(off)} of the values are off by more than "
-                f"{audit['tolerance_noise']:g} of the sensor's noise; --samples {audit['samples_needed']} would do"
+                f"{audit['tolerance_noise']:g} times the sensor's noise; --samples {audit['samples_needed']} would do"
             ]
         if audit.get("short_of_rays"):
             return [
                 f"NOT MET: by their stated error {_percent(audit['short_of_rays'])} of the values are off by more than "
-                f"{audit['tolerance_noise']:g} of the sensor's noise, with the most rays that a value may have; no "
+                f"{audit['tolerance_noise']:g} times the sensor's noise, with the most rays that a value may have; no "
                 "--quality would do, but the exact mode (--samples) has no such limit"
             ]
         return [f"NOT MET: this run is worse than asked for; --quality {audit['quality_needed']:g} would do"]

@@ -78,15 +78,15 @@ def show(recording: Recorded, progress: Progress | None = None) -> None:
 
 def _of(recording: Recorded) -> Any:
     name = None if recording.path is None else recording.path.name
-    return viewer_module(recording.path).RecordingStream("hesim_render", recording_id=name)
+    return viewer_module().RecordingStream("hesim_render", recording_id=name)
 
 
-def viewer_module(place: Path | None) -> Any:
+def viewer_module() -> Any:
     """The module of the viewer."""
     try:
         import rerun
     except ImportError:
-        raise SpecError(f"the viewer needs rerun: {how_to_install('view')}", file=str(place or "recording")) from None
+        raise SpecError(f"the viewer needs rerun: {how_to_install('view')}") from None
     return rerun
 
 

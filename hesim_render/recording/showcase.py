@@ -15,6 +15,7 @@ from PIL import Image
 
 from hesim_render.core.guard import printable
 from hesim_render.core.output import replacing
+from hesim_render.core.progress import counted
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.recording import preview
@@ -63,8 +64,8 @@ def write_previews(recording: Recorded, folder: Path) -> list[Path]:
 
 
 def moves(recording: Recorded) -> bool:
-    """True if the scene of a recording has motion; a video always counts as moving."""
-    if "video" in recording.manifest["settings"]:
+    """True if the scene of a recording has motion; videos and captures of real sensors count as moving."""
+    if recording.manifest["settings"].keys() & {"video", "imported"}:
         return True
     scene = recording.manifest.get("scene") or {}
     return bool(scene.get("spec", {}).get("motion"))
@@ -95,7 +96,7 @@ def middle_views(recording: Recorded) -> list[Panel]:
         last = min(first + window_us, end_us)
         events = recording.event_slice(first, last + 1)
         picture = events_picture(colour, events, recording.event_shape)
-        panels.append(Panel(picture, f"{_count(events.size, 'event')} in {_ms(last - first)}: ON orange, OFF blue"))
+        panels.append(Panel(picture, f"{counted(events.size, 'event')} in {_ms(last - first)}: ON orange, OFF blue"))
     return panels
 
 
@@ -114,7 +115,8 @@ def contact_sheet(recording: Recorded) -> Image.Image:
         part
         for part in (
             scene, mosaic.sensor, f"{_size(recording)} px", _ms(recording.duration_us),
-            _count(counts["frames"], "frame"), _count(counts["events"], "event"), f"seed {recording.manifest['seed']}",
+            counted(counts["frames"], "frame"), counted(counts["events"], "event"),
+            f"seed {recording.manifest['seed']}",
         )
         if part
     )  # fmt: skip
@@ -168,10 +170,6 @@ def _size(recording: Recorded) -> str:
 
 def _ms(microseconds: int) -> str:
     return f"{microseconds / 1000:g} ms"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def write_preview_dng(path: Path, frame: Frame, mosaic: Mosaic) -> None:

@@ -36,7 +36,7 @@ class RecordingWriter:
     sensor : with the region and lens in use.
     scene : model of the scene file, None where there is none (a video).
     seed : seed of the run, for the manifest.
-    duration_us : length of the recording, µs.
+    duration_us, begin_us : length of the recording, and its begin on the clock of its events, µs.
     settings : further settings of the run (``clean``, ``without``, ``samples``, ``backend``); plain values.
     overwrite : replace an existing recording.
     mosaic : description of the mosaic; default: that of the sensor under the light of the scene. A video gives its own.
@@ -62,9 +62,10 @@ class RecordingWriter:
         overwrite: bool = False,
         mosaic: Mosaic | None = None,
         live: bool = False,
+        begin_us: int = 0,
     ) -> None:
         self._manifest = manifests.build(
-            sensor, scene=scene, seed=seed, duration_us=duration_us, settings=settings or {}
+            sensor, scene=scene, seed=seed, duration_us=duration_us, settings=settings or {}, begin_us=begin_us
         )
         if mosaic is not None:
             noise = self._manifest["mosaic"]["noise_profile"]

@@ -44,10 +44,11 @@ def pareto_plot(rows: Table, title: str) -> str:
     error, snr, clipped, names = rows[PARETO[0]], rows[PARETO[1]], rows["white_clipped"].astype(bool), _labels(rows)
     for k, name in enumerate(dict.fromkeys(names)):
         own = np.array([other == name for other in names])
+        clips = bool(clipped[own].any())
         axes.plot(
             error[own], snr[own], linestyle="none", marker=_MARKERS[k % len(_MARKERS)], markersize=7,
-            color=COLOURS[k % len(COLOURS)], fillstyle="none" if clipped[own].any() else "full",
-            label=name + (" (white clips)" if clipped[own].any() else ""),
+            color=COLOURS[k % len(COLOURS)], fillstyle="none" if clips else "full",
+            markeredgewidth=1.5 if clips else 0, label=name + (" (white clips)" if clips else ""),
         )  # fmt: skip
     front = np.flatnonzero(pareto_front(error, snr))
     order = front[np.argsort(error[front])]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +13,8 @@ from hesim_render.studies.table import Cell, Table
 _RANKED, _COST = "ysnr_noise_aware", "delta_e_mean_noise_aware"
 #: Names of a candidate, but for those that are the same in every row.
 _OWN = ("filter_set", "sensor", "crosstalk")
+#: Candidates that a sentence names; the tables have the others.
+_MOST_NAMED = 6
 #: A cost within this part of the least one is no cost.
 _ALIKE = 0.05
 #: Figures of a design without an interval that differ by no more than this part count as equal.
@@ -100,8 +103,10 @@ def _sentence(rows: Table, own: Sequence[str]) -> str | None:
     ranked = sorted((_ranked(row, own) for row in rows if row[_RANKED] is not None), key=lambda one: -one.value)
     saturated = [_name(row, own) for row in rows if row[_RANKED] is None and row.get("white_clipped")]
     order = str(ranked[0]) if ranked else "none"
-    for before, after in zip(ranked[:-1], ranked[1:], strict=True):
+    for before, after in itertools.pairwise(ranked[:_MOST_NAMED]):
         order += f" {'>' if before.low > after.high else '~'} {after}"
+    if len(ranked) > _MOST_NAMED:
+        order += f", and {len(ranked) - _MOST_NAMED} more"
     text = f"noise-aware YSNR {order}"
     known = [(one.cost, one) for one in ranked if one.cost is not None]
     if known:
@@ -109,7 +114,7 @@ def _sentence(rows: Table, own: Sequence[str]) -> str | None:
         first = ranked[0]
         if first.cost is not None and first.cost > (1 + _ALIKE) * least:
             text += (
-                f"; worse for it: the noise-aware ΔE2000 of {first.name} is {first.cost:.3g}, that of {best.name} "
+                f"; but the noise-aware ΔE2000 of {first.name} is larger: {first.cost:.3g}, that of {best.name} "
                 f"{least:.3g}"
             )
         elif first.cost is not None:
@@ -161,7 +166,7 @@ def design_verdict(verdict: Mapping[str, Any]) -> list[str]:
         if key in verdict:
             own, other = verdict[key], verdict[f"{key}_against"]
             if abs(own - other) > _EQUAL * abs(other):
-                (better if (own > other) == more_is_better else worse).append(f"{title} {own:.3g} after {other:.3g}")
+                (better if (own > other) == more_is_better else worse).append(f"{title} {own:.3g} against {other:.3g}")
     sentences = [f"The designed set {word} {verdict['against']} ({costs})."]
     sentences += [f"{name}: {', '.join(texts)}." for name, texts in (("Better", better), ("Worse", worse)) if texts]
     if verdict["clipped_lux"]:

@@ -427,7 +427,7 @@ def test_damaged_clips_are_discarded_and_made_again(tmp_path, capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(["benchmark", "verify", str(built.root), "--discard"])
     told = capsys.readouterr()
-    assert end.value.code == 1 and "was changed" in told.err and "removed 1 clips" in told.out
+    assert end.value.code == 1 and "was changed" in told.err and "removed 1 clip;" in told.out
     assert not first.folder.exists() and not (built.root / "benchmark.json").exists()
     again = build_benchmark(spec, built.root, estimate=False)
     assert digest_of(again) == digest and verify_benchmark(built.root) == []

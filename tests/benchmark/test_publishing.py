@@ -62,7 +62,8 @@ def test_the_card_begins_with_the_header_that_hubs_read(built):
     _, header, body = text.split("---\n", 2)
     values = YAML(typ="safe").load(header)
     assert values["pretty_name"] == "small" and values["size_categories"] == ["n<1K"]
-    assert values["task_categories"] == ["image-to-image", "depth-estimation", "image-segmentation"]
+    tasks = ["image-to-image", "depth-estimation", "image-segmentation", "object-detection"]
+    assert values["task_categories"] == tasks
     assert "event-camera" in values["tags"] and body.startswith("\n# small\n")
 
 

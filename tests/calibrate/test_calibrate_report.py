@@ -49,6 +49,20 @@ def test_sections_stand_side_by_side(both):
     assert left == ["aps.html", "both.html", "c.yaml", "c_aps_maps-HASH.npz", "c_evs_maps-HASH.npz", "set"]
 
 
+def test_the_truth_of_a_virtual_session_stands_beside_its_estimates(both):
+    """In the table of parameters, not as one line of all keys; one outside of its interval says so."""
+    folder, _ = both
+    text = (folder / "c.yaml").read_text(encoding="utf-8")
+    gain = read_calibration(folder / "c.yaml")["aps"]["K"]["value"]
+    truth = f"truth: {{aps: {{K: {gain:.8g}, read_noise_e: 99.0}}, evs: {{B: 7.0}}}}"
+    (folder / "known.yaml").write_text(text.replace("capture: {", f"capture: {{{truth}, "), encoding="utf-8")
+    page = write_report(folder / "known.yaml", folder / "known.html").read_text(encoding="utf-8")
+    assert f"; truth {gain:.5g}</td>" in page and "; truth 99 (outside)</td>" in page
+    assert "; truth 7 (outside)</td>" in page and "<td>truth</td>" not in page
+    (folder / "known.html").unlink()
+    (folder / "known.yaml").unlink()
+
+
 class _Checker(HTMLParser):
     def __init__(self):
         super().__init__()
@@ -76,6 +90,7 @@ def test_the_report_is_one_whole_file(both, name, headings):
     checker = _Checker()
     checker.feed(page)
     assert checker.open == []
+    assert 'name="viewport"' in page and page.count('<div class="table"><table>') == page.count("<table>") > 0
     for link in checker.links:  # a mark is drawn once and used again: a link within the page
         assert link.startswith("data:image/png;base64,") or (link[0] == "#" and f'id="{link[1:]}"' in page)
     assert "<script" not in page and "nan" not in re.sub(r"base64,[^\"]*", "", page).lower().replace("nance", "")

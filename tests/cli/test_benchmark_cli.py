@@ -25,9 +25,9 @@ def spec(tmp_path_factory):
 def test_a_benchmark_is_built_verified_evaluated_and_exported(spec, tmp_path, capsys):
     out = tmp_path / "b"
     status, text, _ = call(capsys, "benchmark", "build", spec, "--out", out, "--workers", 0)
-    assert status == 0 and text.startswith("estimate: 1 clips, about") and "1 clips (0 train, 0 val, 1 test)" in text
+    assert status == 0 and text.startswith("estimate: 1 clip, about") and "1 clip (0 train, 0 val, 1 test)" in text
     status, text, _ = call(capsys, "benchmark", "verify", out)
-    assert status == 0 and "1 clips are as they were built; digest" in text
+    assert status == 0 and "1 clip as built; digest" in text
     # the same command again builds nothing
     assert call(capsys, "benchmark", "build", spec, "--out", out, "--workers", 0)[0] == 0
     status, text, _ = call(capsys, "benchmark", "evaluate", out, "--out", tmp_path / "s.json", "--tasks", "deblur")
@@ -80,5 +80,5 @@ def test_a_long_build_has_to_be_wanted(spec, tmp_path, capsys, monkeypatch):
 
         cli.main(["benchmark", "build", str(spec), "--out", str(tmp_path / "b"), "--workers", "0"])
     out, err = capsys.readouterr()
-    assert stopped.value.code == 2 and "--yes" in err and out.startswith("estimate: 1 clips")
+    assert stopped.value.code == 2 and "--yes" in err and out.startswith("estimate: 1 clip,")
     assert not list((tmp_path / "b" / "clips").iterdir())

@@ -369,3 +369,13 @@ def test_texts_on_the_axes_of_the_picture_do_not_overlap(name, tmp_path, monkeyp
         curve, point = lines["all events"], lines["data sheet, all events"]
         (lux,), (rate,) = point.get_data()
         np.testing.assert_allclose(np.interp(lux, *curve.get_data()), rate, rtol=0.05)
+
+
+def test_large_figures_of_the_table_have_no_exponent():
+    """A full well or an exposure of 10,000 is a number to compare with a data sheet."""
+    figures = figures_of(hr.load_sensor("reference-mono", {"aps.full_well_e": 10715, "aps.exposure_us": 10_000}))
+    lines = list(table_lines(figures))
+    (well,) = (line for line in lines if "full well" in line)
+    assert well.split()[-2:] == ["10715", "e⁻"]
+    latencies = [line for line in lines if " lx " in line]
+    assert latencies and not any("e+" in line for line in lines)

@@ -1,13 +1,16 @@
 """Captures as recordings: what goes in comes out, and what does not fit the sensor is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import recordings
 from event_files import made, written
 from test_bad_files import command
 
-from hesim_render.core.errors import HesimError
+from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.recording.imports import import_recording
+from hesim_render.recording.outline import parameters
 from hesim_render.recording.recording import Recording
 
 
@@ -70,7 +73,10 @@ def test_the_command_makes_a_recording(capsys, tmp_path):
     assert (status, error) == (0, "") and "RAW frames: 1 of 128x96 px" in told and "events: 20000" in told
     np.testing.assert_array_equal(Recording.load(tmp_path / "new").events, given.events)
     status, _, error = command(capsys, "import", events, events, "--out", tmp_path / "x")
-    assert (status, error) == (2, "hesim-render: more than one file, --roi or --trigger-channel needs --sensor\n")
+    assert (status, error) == (
+        2,
+        "hesim-render: more than one file, --roi, --trigger-channel or --from-zero needs --sensor\n",
+    )
 
 
 @pytest.mark.parametrize("name", ["davis346", "reference-bayer", "eiger"])
@@ -146,3 +152,55 @@ def test_images_of_other_writers(tmp_path):
     with pytest.raises(HesimError, match="give no other files"):
         import_recording(tmp_path / "s", sensor, frames=[file_of(*messages), tmp_path / "x.png"])
     assert not (tmp_path / "s").exists()
+
+
+def test_a_recording_begins_where_its_events_do(tmp_path):
+    """The clock of a camera that has run for hours is no part of the recording; times stay those of the file."""
+    sensor = recordings.sensor_like("eiger")
+    first_us = 2 * 3600 * 1_000_000 + 3_000  # more than what 32 bits hold
+    events = made((first_us, 1, 2, 1), (first_us + 97_000, 3, 4, -1))
+    file = written(events, "evt3", tmp_path, sensor.layout.evs_shape)
+    recording = import_recording(tmp_path / "r", sensor, events=file)
+    assert recording.manifest["time"] == {"begin_us": first_us - 1000, "end_us": first_us + 97_000}
+    np.testing.assert_array_equal(recording.events["t_us"], [first_us, first_us + 97_000])
+    assert ("time", "0.098 s from 7200.002 s on") in parameters(recording)
+    (axes,) = (axes for axes in recording.plot().axes if "Events" in axes.get_title("left") + axes.get_title())
+    assert axes.get_xlabel() == "time, s after 7200.002 s" and axes.dataLim.x1 == pytest.approx(0.098, abs=1e-5)
+    assert (tmp_path / "r" / "events.h5").stat().st_size < 100_000  # its index does not begin at 0
+    ticks = recording.export("raw-npz", tmp_path / "ticks")
+    assert sum(np.abs(np.load(name)["events"]).sum() for name in ticks.glob("*_evs.npz")) == 2
+    # what is written from it is an event file of the same times
+    again = import_recording(tmp_path / "again", sensor, events=recording.export("dsec", tmp_path / "e.h5"))
+    assert again.manifest["time"] == recording.manifest["time"]
+    np.testing.assert_array_equal(again.events, recording.events)
+
+
+def test_times_of_the_day_can_be_counted_from_zero(tmp_path, capsys):
+    """MCAP files of ROS have the time of day, which EVT3 cannot hold; frames move with the events."""
+    given = recordings.make("davis346", tmp_path / "r", frames=2)
+    now_us = 1_760_000_000_000_000
+    frames = [
+        replace(frame, t_us=frame.t_us + now_us, exposure_start_us=frame.exposure_start_us + now_us)
+        for frame in given.frames
+    ]
+    time = {name: us + now_us for name, us in given.manifest["time"].items()}
+    events = given.events.copy()
+    events["t_us"] += now_us
+    day = Recording(frames, {**given.manifest, "time": time, "frames": [f.times for f in frames]}, events=events)
+    file = day.export("mcap", tmp_path / "day.mcap")
+    words = ("import", file, "--sensor", "davis346", "--roi", "128x96", "--out")
+    assert command(capsys, *words, tmp_path / "late")[0] == 0
+    late = Recording.load(tmp_path / "late")
+    np.testing.assert_array_equal(late.events, events)
+    with pytest.raises(SpecError, match="EVT3 ends at"):
+        late.export("evt3", tmp_path / "late.raw")
+    assert command(capsys, *words, tmp_path / "new", "--from-zero")[0] == 0
+    new = Recording.load(tmp_path / "new")
+    begin_us = late.manifest["time"]["begin_us"]
+    assert new.manifest["time"] == {"begin_us": 0, "end_us": late.manifest["time"]["end_us"] - begin_us}
+    np.testing.assert_array_equal(new.events["t_us"] + begin_us, events["t_us"])
+    for moved, frame in zip(new.frames, frames, strict=True):
+        assert moved.exposure_start_us + begin_us == frame.exposure_start_us and moved.t_us + begin_us == frame.t_us
+    new.export("evt3", tmp_path / "new.raw")
+    status, _, error = command(capsys, "import", file, "--from-zero", "--out", tmp_path / "x.h5")
+    assert status == 2 and "needs --sensor" in error

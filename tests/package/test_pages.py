@@ -2,6 +2,7 @@
 
 import functools
 import re
+import runpy
 import shlex
 import subprocess
 from pathlib import Path
@@ -100,6 +101,24 @@ def test_files_of_a_page_are_valid(page, tmp_path):
                 hr.load_sensor(tmp_path / block.title)
             elif "camera" in content or "mitsuba" in content:
                 hr.load_scene(tmp_path / block.title)
+
+
+def test_the_site_does_not_cut_options_and_short_names():
+    """At their hyphens, where browsers do; what is copied from a block stays the same."""
+    pytest.importorskip("mkdocs")
+    hooks = runpy.run_path(str(ROOT / "docs" / "hooks.py"))
+    page = "<p><code>--roi</code> <code>view RECORDING --no-viewer</code></p>"
+    page += '<div class="language-bash highlight"><code>a<span class="w"> </span>--out<span class="w"> </span>b</div>'
+    shown = hooks["on_page_content"](page)
+    assert "<code class=whole>--roi</code>" in shown and " <span class=whole>--no-viewer</span></code>" in shown
+    assert "</span><span class=whole>--out</span><span" in shown and "<span class=whole>b" not in shown
+    assert hooks["plain_text"](shown) == hooks["plain_text"](page)
+
+
+def test_no_link_is_named_after_its_file():
+    """The text of a link says what is behind it."""
+    named = re.compile(r"\[[\w/-]+\.md\]\(")
+    assert [name_of(page) for page in PAGES if named.search(page.read_text(encoding="utf-8"))] == []
 
 
 def test_blocks_that_are_not_run_say_why():

@@ -26,8 +26,9 @@ def test_bounds_are_told_where_enough_was_seen():
     assert lines() == [
         "render, events: stated error 0.29 of the sensor's noise (rms, asked for 0.5); 95 % of values below 0.6, 99 % "
         "below 0.8",
-        "audit, events: true deviation rms 0.31; 0.1 % of values are off by more than 1.5 of the noise, with 99 % "
-        "confidence at most 1.3 %; missed 0.4 % of signal events, at most 1.8 %; too many 0.2 %, at most 0.9 %",
+        "audit, events: true deviation rms 0.31; 0.1 % of values are off by more than 1.5 times the noise "
+        "(with 99 % confidence at most 1.3 %); of signal events 0.4 % missed (at most 1.8 %), 0.2 % extra "
+        "(at most 0.9 %)",
     ]
     assert render_lines(None) == []
 
@@ -53,14 +54,14 @@ def test_a_few_of_the_runs_that_miss_their_quality_are_named(monkeypatch):
 
 
 @pytest.mark.parametrize(("shares", "told"), [
-    ({"missed": 0.0, "extra": 0.0}, "of 7 signal events that were seen none was missed and none is too many, too few"),
-    ({"missed": 0.012, "extra": 0.0}, "of 7 signal events that were seen 1.2 % are missed, 0 % too many, too few"),
+    ({"missed": 0.0, "extra": 0.0}, "of 7 signal events that were seen none was missed and none was extra (too few"),
+    ({"missed": 0.012, "extra": 0.0}, "of 7 signal events that were seen 1.2 % are missed, 0 % extra (too few"),
     ({"missed": 0.0, "extra": 0.0, "extra_at_most": 0.04}, "none was missed"),  # one of both bounds is enough
 ])  # fmt: skip
 def test_a_bound_that_says_nothing_is_no_threat(shares, told):
     """Bounds of 100 % follow from a few events, in which nothing was wrong."""
     text = lines("not shown", true=6.0, found=7.0, **{"missed_at_most": 1.0, "extra_at_most": 1.0} | shares)
-    assert told in text[1] and text[1].endswith("too few for a bound")
+    assert told in text[1] and text[1].endswith("(too few for a bound)")
     assert "at most 100 %" not in text[1]
     assert text[2:] == [
         "audit: nothing speaks against this run, but too little was seen to confirm its quality; a longer --duration "
@@ -69,17 +70,17 @@ def test_a_bound_that_says_nothing_is_no_threat(shares, told):
 
 
 def test_a_wide_bound_is_still_told():
-    assert "missed 0 % of signal events, at most 24 %" in lines("not shown", missed=0.0, missed_at_most=0.24)[1]
+    assert "of signal events 0 % missed (at most 24 %)" in lines("not shown", missed=0.0, missed_at_most=0.24)[1]
 
 
 def test_what_speaks_against_a_run_keeps_its_figures():
     text = lines("not met", 0.21, missed=0.3, missed_at_most=1.0, extra_at_most=1.0)
-    assert "missed 30 % of signal events, at most 100 %; too many 0.2 %, at most 100 %" in text[1]
+    assert "of signal events 30 % missed (at most 100 %), 0.2 % extra (at most 100 %)" in text[1]
     assert text[2:] == ["NOT MET: this run is worse than asked for; --quality 0.21 would do"]
     # no true event was seen, and all of the run's are too many
     text = lines("not met", 0.21, true=0.0, found=2.0, missed=0.0, missed_at_most=1.0, extra=1.0, extra_at_most=1.0)
-    assert "too many 100 %, at most 100 %" in text[1]
-    assert "events, at most" not in lines(true=0.0, found=0.0)[1]
+    assert "100 % extra (at most 100 %)" in text[1]
+    assert "of signal events" not in lines(true=0.0, found=0.0)[1]
 
 
 def test_verdicts_of_many_runs_are_counted():
@@ -107,8 +108,8 @@ def test_a_run_whose_values_have_the_most_rays_names_no_quality():
         line for line in render_lines({"error_noise": error, "quality": 0.5, "audit": audit}) if "NOT MET" in line
     )
     assert line.endswith(
-        "by their stated error 31 % of the values are off by more than 1.5 of the sensor's noise, with the most rays "
-        "that a value may have; no --quality would do, but the exact mode (--samples) has no such limit"
+        "by their stated error 31 % of the values are off by more than 1.5 times the sensor's noise, with the most "
+        "rays that a value may have; no --quality would do, but the exact mode (--samples) has no such limit"
     )
     many = {"a": capped, "b": {"verdict": "not met", "quality_needed": 0.3}, "c": capped, "d": {"verdict": "met"}}
     (line,) = verdict_lines(many, "clips")

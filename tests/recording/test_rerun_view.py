@@ -173,7 +173,7 @@ def test_a_live_view_needs_a_place_and_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(ZeroDivisionError), RecordingWriter(tmp_path / "r", sensor, seed=7, duration_us=9, live=True):
         1 / 0  # noqa: B018
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(SpecError, match="the viewer needs rerun"):
+    with pytest.raises(SpecError, match=r"^the viewer needs rerun"):
         RecordingWriter(tmp_path / "r", sensor, seed=7, duration_us=9, live=True)
     assert not list(tmp_path.iterdir())
 

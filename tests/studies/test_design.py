@@ -391,8 +391,8 @@ def test_a_verdict_says_what_got_better_and_worse():
     }  # fmt: skip
     assert design_verdict(verdict) == [
         "The designed set has a lower cost than bayer (1.2 and 1.5, difference -0.4 to -0.2).",
-        "Better: noise-aware YSNR at 5 lx 1.12 times, MTF50, cy/px 0.31 after 0.28, false colour, C*ab 4 after 5.",
-        "Worse: YSNR with the matrix of colour at 5 lx 0.93 times, mean ΔE2000 without noise 2.31 after 2.1.",
+        "Better: noise-aware YSNR at 5 lx 1.12 times, MTF50, cy/px 0.31 against 0.28, false colour, C*ab 4 against 5.",
+        "Worse: YSNR with the matrix of colour at 5 lx 0.93 times, mean ΔE2000 without noise 2.31 against 2.1.",
         "White saturates at 200, 1000 lx: take a shorter exposure.",
     ]
     same = verdict | {"cost_difference_high": 0.1, "clipped_lux": []}

@@ -11,6 +11,7 @@ import pytest
 
 import hesim_render as hr
 from hesim_render import cli
+from hesim_render.core.drawing import report_style
 from hesim_render.core.errors import OutputError, RangeError, SpecError
 from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
 from hesim_render.sources.crosstalk import mixed
@@ -19,10 +20,10 @@ from hesim_render.specs.filter_set import read_filter_set, read_palette
 from hesim_render.specs.run import StudyKind, study_kind
 from hesim_render.specs.study import read_study
 from hesim_render.spectral import spectrum as spectra
-from hesim_render.studies import Table, channel_noise, with_filter_set
+from hesim_render.studies import Table, channel_noise, verdict, with_filter_set
 from hesim_render.studies import report as study_report
 from hesim_render.studies.filter_sets import filters_of, mixing
-from hesim_render.studies.plots import pareto_front
+from hesim_render.studies.plots import pareto_front, pareto_plot
 from hesim_render.studies.run import study
 from hesim_render.studies.table import has_parquet
 from hesim_render.studies.verdict import ranking
@@ -432,6 +433,16 @@ def test_pareto_fronts():
     assert pareto_front(cost, gain).tolist() == [True, True, False, True, False]
 
 
+def test_a_set_whose_white_clips_has_a_hollow_marker():
+    """In a style that draws no edges of markers, it was not seen at all."""
+    with report_style():
+        drawn = [
+            pareto_plot(Table({**row, "crosstalk": 0.0, "white_clipped": clips} for row in ranked()), "t")
+            for clips in (True, False)
+        ]
+    assert "stroke-width: 1.5" in drawn[0] and "stroke-width: 1.5" not in drawn[1]
+
+
 def ranked(**changes):
     """Rows of three sets at one level, with figures as a study gives them."""
     common = {"surfaces": "chart", "illuminant": "D65", "illuminance_lux": 20.0, "equal": "exposure", "sensor": "s",
@@ -451,7 +462,7 @@ def test_a_level_of_light_has_a_verdict_in_one_sentence():
     (text,) = ranking(Table(ranked()))
     assert text == (
         "chart, D65, 20 lx, equal exposure: noise-aware YSNR ryyb 41.5 (39.5 to 43.5) > rccb 33 (31 to 35) ~ rggb 30 "
-        "(28 to 32); worse for it: the noise-aware ΔE2000 of ryyb is 3.5, that of rggb 2"
+        "(28 to 32); but the noise-aware ΔE2000 of ryyb is larger: 3.5, that of rggb 2"
     )
     (text,) = ranking(Table(ranked(ryyb={"delta_e_mean_noise_aware": 2.05, "white_clipped": True})))
     assert "ryyb 41.5 (39.5 to 43.5) CLIPPED > rccb" in text
@@ -463,6 +474,12 @@ def test_a_level_of_light_has_a_verdict_in_one_sentence():
     (text,) = ranking(Table(ranked(ryyb=gone)))
     assert "YSNR rccb 33 (31 to 35) ~ rggb" in text
     assert text.endswith("; not ranked, as even the grey card saturates: ryyb")
+
+
+def test_a_verdict_on_many_sets_names_the_first_ones(monkeypatch):
+    monkeypatch.setattr(verdict, "_MOST_NAMED", 2)
+    (text,) = ranking(Table(ranked()))
+    assert "ryyb 41.5 (39.5 to 43.5) > rccb 33 (31 to 35), and 1 more; but the noise-aware ΔE2000 of ryyb" in text
 
 
 def test_levels_and_candidates_of_a_verdict():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from markupsafe import Markup
 
@@ -34,7 +35,7 @@ def write_report(calibration: str | Path, report: str | Path, overwrite: bool = 
     """
     path = check_report(calibration, report, overwrite)
     with as_written(calibration), alone_in(Path(calibration).absolute().parent):
-        data = read_calibration(calibration)
+        data = _with_truth(read_calibration(calibration))
         maps = {section: read_maps(calibration, section, data) for section in SECTIONS if section in data}
     with as_written(calibration), report_style():
         sections = []
@@ -47,8 +48,22 @@ def write_report(calibration: str | Path, report: str | Path, overwrite: bool = 
         page = filled(
             "calibrate/report/page.html", beginning=Markup(report_beginning(calibration)), sections=sections,
             sensor=capture.get("sensor"),
-            capture=[(key, plain_text(value)) for key, value in capture.items() if value not in (None, "")],
+            capture=[
+                (key, plain_text(value)) for key, value in capture.items() if value not in (None, "") and key != "truth"
+            ],
         )  # fmt: skip
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return Path(report)
+
+
+def _with_truth(data: dict[str, Any]) -> dict[str, Any]:
+    """A calibration whose estimates have the truth of a virtual session beside them."""
+    truth = data["capture"].get("truth") or {}
+    return data | {
+        name: data[name] | {
+            key: data[name][key] | {"truth": value}
+            for key, value in truth.get(name, {}).items() if isinstance(data[name].get(key), dict)
+        }
+        for name in SECTIONS if name in data
+    }  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from hesim_render.calibrate.summary import beside
 from hesim_render.core.html import number
 
 #: Headings of the tables of parameters.
@@ -80,13 +81,14 @@ def parameter_row(name: str, item: Any) -> tuple[str, str, str, str]:
 
     Parameters
     ----------
-    item : a number, or what `estimated` and `not_identifiable` give.
+    item : a number, or what `estimated` and `not_identifiable` give, with the ``truth`` of a virtual session.
     """
     if not isinstance(item, dict):
         return name, number(item), "", ""
+    truth = beside(item, item.get("truth"))
     if item["value"] is None:
-        return name, "not identifiable", "", item["reason"]
+        return name, "not identifiable", truth, item["reason"]
     interval = item.get("interval_95")
-    note = item.get("note", "")
     between = f"{interval[0]:.5g} to {interval[1]:.5g}" if interval else ""
-    return name, f"{item['value']:.5g}", between, " ".join(t for t in (item.get("unit", ""), note) if t)
+    why = "; ".join(filter(None, (item.get("unit"), item.get("note"))))
+    return name, f"{item['value']:.5g}", "; ".join(filter(None, (between, truth))), why
