@@ -6,6 +6,7 @@ from test_evs_limits import FIXED, FOLLOWING, RATE, asynchronous, brute_force, e
 
 from hesim_render.pixels.evs import last_event
 from hesim_render.pixels.evs.photoreceptor import Photoreceptor
+from hesim_render.pixels.evs.processes import BandNoise
 from hesim_render.pixels.evs.stage import EvsStage
 
 EVERY_US, SAMPLES, SIDE = 1700, 24, 8
@@ -13,6 +14,11 @@ EVERY_US, SAMPLES, SIDE = 1700, 24, 8
 LEVELS = np.cumsum(np.random.default_rng(5).normal(0, 0.25, (SAMPLES, SIDE, SIDE)), axis=0)
 LEVELS = np.maximum(LEVELS + np.linspace(0.4, 4.0, SIDE), 0.05)
 LEVELS[:3] = LEVELS[2]
+
+NOISY = {
+    "evs__coefficients": [{"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 0.1, "beta5": 0.0}],
+    "evs__threshold_mismatch_rel": 0.1,
+}
 
 
 def events_of(noise, levels=LEVELS, seed=3):
@@ -49,13 +55,30 @@ def stairs(times_us, level, theta_on, theta_off):
     return result
 
 
-@pytest.mark.parametrize("dead_us", (None, 600))
-@pytest.mark.parametrize("follows", (False, True))
-def test_events_are_those_of_the_curve(follows, dead_us):
+def noise_every(times, noise, seed, cutoff_hz):
+    """The noise of all pixels at some times: on lines between its nodes, 16 a period, and the samples."""
+    process = BandNoise(noise, seed=seed)
+    nodes = np.union1d(np.arange(0, times[-1], 1e6 / (16 * cutoff_hz)), EVERY_US * np.arange(SAMPLES))
+    unit = np.array([np.array(process.start(0)), *(np.array(process.at(float(t))) for t in nodes[1:])], float)
+    spread = 0.1 * np.exp(-LEVELS.reshape(SAMPLES, -1))
+    samples = EVERY_US * np.arange(SAMPLES)
+    at_nodes = unit * np.stack([np.interp(nodes, samples, column) for column in spread.T], axis=1)
+    return np.stack([np.interp(times, nodes, column) for column in at_nodes.T], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("follows", "dead_us", "noisy"),
+    ((False, None, False), (False, 600, False), (True, None, False), (True, 600, False), (True, None, True)),
+)
+def test_events_are_those_of_the_curve(follows, dead_us, noisy):
     """Every event against steps of 2 µs; between two nodes, 104 µs apart, y is taken as a straight line."""
-    noise = asynchronous(SIDE, evs__photoreceptor=FOLLOWING if follows else FIXED, evs__refractory_period_us=dead_us)
+    light = {"evs__photoreceptor": FOLLOWING if follows else FIXED, "evs__photoreceptor_cutoff_hz": 130.0}
+    coefficients = {"evs__coefficients": NOISY["evs__coefficients"]} if noisy else {}
+    noise = asynchronous(SIDE, evs__refractory_period_us=dead_us, **light, **coefficients)
     events = events_of(noise)
     times, paths = filtered_every(2.0, LEVELS, follows)
+    if noisy:
+        paths = paths + noise_every(times, noise, 3, 130.0)
     # with a dead time, what is off by a few µs shifts the references of all that follows
     most_us = 40 if dead_us else 12
     total = differing = 0
@@ -71,18 +94,12 @@ def test_events_are_those_of_the_curve(follows, dead_us):
     assert differing <= 2
 
 
-NOISY = {
-    "evs__coefficients": [{"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 0.1, "beta5": 0.0}],
-    "evs__leak_rate_hz": 40.0, "evs__threshold_mismatch_rel": 0.1,
-}  # fmt: skip
-
-
 @pytest.mark.parametrize("drift", (False, True))
 @pytest.mark.parametrize("dead_us", (None, 600))
 def test_pixels_far_from_a_threshold_are_not_followed_and_lose_nothing(dead_us, drift, monkeypatch):
     """All pixels followed, only those that need it, and these in small parts: the same events to the bit."""
     light = {"evs__leak": {"process": "drift", "rate_hz": 30.0}} if drift else {"evs__leak_rate_hz": 40.0}
-    given = {key: value for key, value in NOISY.items() if key != "evs__leak_rate_hz"} | light
+    given = NOISY | light
     given["evs__contrast_threshold_on"] = 0.27 if dead_us else 0.2  # above and below θ₋
     noise = asynchronous(SIDE, evs__photoreceptor=FOLLOWING, evs__refractory_period_us=dead_us, **given)
     counted, along = [], Photoreceptor.along

@@ -272,12 +272,11 @@ class LastEvent:
             index = types.UInt32(pixel)
             curve = low_pass.along(begin, end.log, index, times_us[1:])
             theta = [take(values, index) for values in self._noise.on_device.thresholds]
-            gathered = [take(values, index) for values in (before, first, last, level, self.reference)]
+            gathered = [take(values, index) for values in (before, first, last, self.reference)]
             dr.eval(curve, theta, gathered)
-            start, low, high, stop, own, on_host, off_host = (np.array(values) for values in (*gathered, *theta))
+            start, low, high, own, on_host, off_host = (np.array(values) for values in (*gathered, *theta))
             share = ((times_us[1:] - times_us[0]) / (times_us[-1] - times_us[0])).astype(np.float32)[:, None]
             paths = np.concatenate([start[None], np.array(curve).reshape(-1, pixel.size) + low + share * (high - low)])
-            paths[-1] = stop
             given = due if every.size == pixel.size else of_pixels(due, pixel)
             reference, t_us, fired, polarity = self._on_paths(pixel, paths, times_us, own, (on_host, off_host), given)
             dr.scatter(self.reference, types.Float(reference.astype(np.float32)), index)
