@@ -92,6 +92,30 @@ def test_positions():
         noise.event_probability(np.zeros((32, 32)), 1.0, position=0)
 
 
+def test_parameters_of_some_pixels():
+    """Those of listed pixels, in their order; positions, thresholds and corners differ."""
+    table = [{**COEFFICIENTS, "beta1": 0.8 + 0.1 * p} for p in range(4)]
+    corner = {"cutoff_hz": 300.0, "signal_dn": 200.0, "min_cutoff_hz": 3.0}
+    noise = model("eiger", crop=(64, 64), scale=[1.0, 0.5, 2.0, 1.5], evs__coefficients=table,
+                  evs__threshold_mismatch_rel=0.1, evs__photoreceptor=corner)  # fmt: skip
+    every, chosen = noise.on_device, np.array([700, 3, 4, 98, 1023], np.uint32)
+    some = every.at(jit().UInt32(chosen))
+    log = np.random.default_rng(0).uniform(2.0, 6.0, 32 * 32).astype(np.float32)
+    for own, all_ in (
+        (some.key, every.key),
+        (some.thresholds[0], every.thresholds[0]),
+        (some.thresholds[1], every.thresholds[1]),
+        (some.log_of_largest_corner, every.log_of_largest_corner),
+        (
+            some.corner_hz(jit().Float(log[chosen]), noise.photoreceptor),
+            every.corner_hz(jit().Float(log), noise.photoreceptor),
+        ),
+    ):
+        expected = np.array(all_)[chosen]
+        np.testing.assert_array_equal(np.array(own), expected)
+        assert len(np.unique(expected)) > 1
+
+
 def test_images_use_each_pixels_thresholds():
     noise = model("gen2", crop=(256, 256), evs__threshold_mismatch_rel=0.1)
     image = np.full((64, 64), 5.0)
