@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hesim_render.core.backend import jit
@@ -25,46 +27,75 @@ def widest_gap(x: Float, y: Float, side: Float, rays: int) -> tuple[Float, Float
     import drjit as dr
 
     types = jit()
-    pair = dr.arange(types.UInt32, len(side) // rays)
-    first, last = pair * dr.opaque(types.UInt32, rays), (pair + 1) * dr.opaque(types.UInt32, rays)
+    projected = _Projected(x, y, dr.zeros(types.Float, len(side)), side, rays)
 
-    def ends(angle: Float) -> tuple[Float, Float]:
-        """Largest projection of the lower side, smallest of the higher one."""
-        sine, cosine = dr.sincos(angle)
-
-        def step(k: UInt32, lower: Float, higher: Float) -> tuple[UInt32, Float, Float]:
-            at = cosine * dr.gather(types.Float, x, k) + sine * dr.gather(types.Float, y, k)
-            is_high = dr.gather(types.Float, side, k) > 0
-            lower = dr.maximum(lower, dr.select(is_high, -10.0, at))
-            return k + 1, lower, dr.minimum(higher, dr.select(is_high, at, 10.0))
-
-        state = types.UInt32(first), dr.full(types.Float, -10, len(pair)), dr.full(types.Float, 10, len(pair))
-        _, lower, higher = dr.while_loop(state, lambda k, *_: k < last, step, label="projected rays")
-        return lower, higher
-
-    def attempt(
-        number: UInt32, centre: Float, best: Float, gap: Float, at: Float
-    ) -> tuple[UInt32, Float, Float, Float, Float]:
+    def attempt(number: UInt32, best: Float, gap: Float, at: Float) -> tuple[UInt32, Float, Float, Float]:
         is_coarse = number < _COARSE
         fine = number - _COARSE
-        # each round spans one step of the round before it
-        centre = dr.select(~is_coarse & (fine % _FINE == 0), best, centre)
+        # each round spans one step of the round before it, about the best direction so far
         span = (2 * np.pi / _COARSE) * dr.power(types.Float(1 / _FINE), types.Float(fine // _FINE))
-        place = (types.Float(fine % _FINE) + 0.5) / _FINE - 0.5
-        angle = dr.select(is_coarse, types.Float(number) * (2 * np.pi / _COARSE), centre + place * span)
-        lower, higher = ends(angle)
-        wider = higher - lower > gap
-        return (
-            number + 1, centre, dr.select(wider, angle, best), dr.select(wider, higher - lower, gap),
-            dr.select(wider, 0.5 * (lower + higher), at),
-        )  # fmt: skip
+        angles = []
+        for turn in range(_FINE):
+            place = (types.Float(turn) + 0.5) / _FINE - 0.5
+            coarse = types.Float(number + turn) * (2 * np.pi / _COARSE)
+            angles.append(dr.select(is_coarse, coarse, best + place * span))
+        turned = [dr.sincos(angle) for angle in angles]
+        ends = projected.ends([(cosine, sine, types.Float(0)) for sine, cosine in turned])
+        for angle, (lower, higher) in zip(angles, ends, strict=True):
+            wider = higher - lower > gap
+            best, gap = dr.select(wider, angle, best), dr.select(wider, higher - lower, gap)
+            at = dr.select(wider, 0.5 * (lower + higher), at)
+        return number + _FINE, best, gap, at
 
-    zero = dr.zeros(types.Float, len(pair))
-    state = dr.zeros(types.UInt32, len(pair)), zero, zero, dr.full(types.Float, -100, len(pair)), zero
+    zero = dr.zeros(types.Float, projected.pairs)
+    state = dr.zeros(types.UInt32, projected.pairs), zero, dr.full(types.Float, -100, projected.pairs), zero
     best_fit = dr.while_loop(
         state, lambda number, *_: number < _COARSE + _ROUNDS * _FINE, attempt, label="directions of edges"
     )
-    return best_fit[2], best_fit[3], best_fit[4]
+    return best_fit[1], best_fit[2], best_fit[3]
+
+
+class _Projected:
+    """Rays of pairs, which are projected onto several directions at a time: fetching them takes most of the time.
+
+    Parameters
+    ----------
+    x, y, time, side : see `widest_moving_gap`.
+    rays : rays of each pair.
+    """
+
+    def __init__(self, x: Float, y: Float, time: Float, side: Float, rays: int) -> None:
+        import drjit as dr
+
+        types = jit()
+        # the four numbers of a ray side by side, so that one fetch brings them
+        self._rays: Float = dr.ravel(types.Array4f(x, y, time, side))
+        dr.eval(self._rays)
+        self.pairs = len(side) // rays
+        pair = dr.arange(types.UInt32, self.pairs)
+        self._first = pair * dr.opaque(types.UInt32, rays)
+        self._last = (pair + 1) * dr.opaque(types.UInt32, rays)
+
+    def ends(self, directions: Sequence[tuple[Float, Float, Float]]) -> list[tuple[Float, Float]]:
+        """Largest projection of the lower side and smallest of the higher one, in each direction."""
+        import drjit as dr
+
+        types = jit()
+
+        def step(k: UInt32, *ends: Float) -> tuple[UInt32, *tuple[Float, ...]]:
+            x, y, time, side = dr.gather(types.Array4f, self._rays, k)
+            is_high, result = side > 0, list[Float]()
+            for (a, b, c), lower, higher in zip(directions, ends[::2], ends[1::2], strict=True):
+                at = a * x + b * y + c * time
+                result.append(dr.maximum(lower, dr.select(is_high, -10.0, at)))
+                result.append(dr.minimum(higher, dr.select(is_high, at, 10.0)))
+            return k + 1, *result
+
+        start = [dr.full(types.Float, 10 * sign, self.pairs) for _ in directions for sign in (-1, 1)]
+        _, *reached = dr.while_loop(
+            (types.UInt32(self._first), *start), lambda k, *_: k < self._last, step, label="projected rays"
+        )
+        return list(zip(reached[::2], reached[1::2], strict=True))
 
 
 def widest_moving_gap(
@@ -89,76 +120,50 @@ def widest_moving_gap(
     import drjit as dr
 
     types = jit()
-    pair = dr.arange(types.UInt32, len(side) // rays)
-    first, last = pair * dr.opaque(types.UInt32, rays), (pair + 1) * dr.opaque(types.UInt32, rays)
+    projected = _Projected(x, y, time, side, rays)
     steps = table(types.Float, np.tan(np.deg2rad(np.array(_STEPS_DEG, np.float32))))
     dr.make_opaque(steps)
     turns = 2 * np.pi / _AROUND
 
-    def ends(a: Float, b: Float, c: Float) -> tuple[Float, Float]:
-        """Largest projection of the lower side, smallest of the higher one."""
-
-        def step(k: UInt32, lower: Float, higher: Float) -> tuple[UInt32, Float, Float]:
-            at = (
-                a * dr.gather(types.Float, x, k)
-                + b * dr.gather(types.Float, y, k)
-                + c * dr.gather(types.Float, time, k)
-            )
-            is_high = dr.gather(types.Float, side, k) > 0
-            lower = dr.maximum(lower, dr.select(is_high, -10.0, at))
-            return k + 1, lower, dr.minimum(higher, dr.select(is_high, at, 10.0))
-
-        state = types.UInt32(first), dr.full(types.Float, -10, len(pair)), dr.full(types.Float, 10, len(pair))
-        _, lower, higher = dr.while_loop(state, lambda k, *_: k < last, step, label="projected rays")
-        return lower, higher
-
     def attempt(
-        number: UInt32, ca: Float, cb: Float, cc: Float, a: Float, b: Float, c: Float, gap: Float, at: Float
-    ) -> tuple[UInt32, Float, Float, Float, Float, Float, Float, Float, Float]:
+        number: UInt32, a: Float, b: Float, c: Float, gap: Float, at: Float
+    ) -> tuple[UInt32, Float, Float, Float, Float, Float]:
         is_coarse = number < _SPHERE
-        # even over the sphere: a spiral by the golden angle
-        height = 1 - (2 * types.Float(number) + 1) / _SPHERE
-        sine, cosine = dr.sincos(types.Float(number) * (np.pi * (3 - 5**0.5)))
-        radius = dr.sqrt(dr.maximum(1 - height * height, 0))
-        # each round is about the best direction of the rounds before it
+        # each round is about the best direction of the rounds before it: two directions across that one [duff2017]
         fine = number - _SPHERE
-        is_new = ~is_coarse & (fine % _AROUND == 0)
-        ca, cb, cc = dr.select(is_new, a, ca), dr.select(is_new, b, cb), dr.select(is_new, c, cc)
-        # two directions across it [duff2017]
-        sign = dr.select(cc >= 0, types.Float(1), -1)
-        p = -1 / (sign + cc)
-        q = ca * cb * p
+        sign = dr.select(c >= 0, types.Float(1), -1)
+        p = -1 / (sign + c)
+        q = a * b * p
         tilt = dr.gather(types.Float, steps, dr.minimum(fine // _AROUND, len(_STEPS_DEG) - 1))
-        s, r = dr.sincos(types.Float(fine % _AROUND) * turns)
-        r, s = r * tilt, s * tilt
-        na = ca + r * (1 + sign * ca * ca * p) + s * q
-        nb = cb + r * sign * q + s * (sign + cb * cb * p)
-        nc = cc - r * sign * ca - s * cb
-        scale = dr.rsqrt(na * na + nb * nb + nc * nc)
-        da = dr.select(is_coarse, radius * cosine, na * scale)
-        db = dr.select(is_coarse, radius * sine, nb * scale)
-        dc = dr.select(is_coarse, height, nc * scale)
-        lower, higher = ends(da, db, dc)
-        wider = higher - lower > gap
-        return (
-            number + 1, ca, cb, cc, dr.select(wider, da, a), dr.select(wider, db, b), dr.select(wider, dc, c),
-            dr.select(wider, higher - lower, gap), dr.select(wider, 0.5 * (lower + higher), at),
-        )  # fmt: skip
+        directions = []
+        for turn in range(_AROUND):
+            # even over the sphere: a spiral by the golden angle
+            place = number + turn
+            height = 1 - (2 * types.Float(place) + 1) / _SPHERE
+            sine, cosine = dr.sincos(types.Float(place) * (np.pi * (3 - 5**0.5)))
+            radius = dr.sqrt(dr.maximum(1 - height * height, 0))
+            s, r = dr.sincos(types.Float(turn) * turns)
+            r, s = r * tilt, s * tilt
+            na = a + r * (1 + sign * a * a * p) + s * q
+            nb = b + r * sign * q + s * (sign + b * b * p)
+            nc = c - r * sign * a - s * b
+            scale = dr.rsqrt(na * na + nb * nb + nc * nc)
+            directions.append((
+                dr.select(is_coarse, radius * cosine, na * scale), dr.select(is_coarse, radius * sine, nb * scale),
+                dr.select(is_coarse, height, nc * scale),
+            ))  # fmt: skip
+        for (da, db, dc), (lower, higher) in zip(directions, projected.ends(directions), strict=True):
+            wider = higher - lower > gap
+            a, b, c = dr.select(wider, da, a), dr.select(wider, db, b), dr.select(wider, dc, c)
+            gap = dr.select(wider, higher - lower, gap)
+            at = dr.select(wider, 0.5 * (lower + higher), at)
+        return number + _AROUND, a, b, c, gap, at
 
-    zero, one = dr.zeros(types.Float, len(pair)), dr.full(types.Float, 1, len(pair))
-    state = (
-        dr.zeros(types.UInt32, len(pair)),
-        one,
-        zero,
-        zero,
-        one,
-        zero,
-        zero,
-        dr.full(types.Float, -100, len(pair)),
-        zero,
-    )
+    count = projected.pairs
+    zero, one = dr.zeros(types.Float, count), dr.full(types.Float, 1, count)
+    state = dr.zeros(types.UInt32, count), one, zero, zero, dr.full(types.Float, -100, count), zero
     most = _SPHERE + _AROUND * len(_STEPS_DEG)
-    *_, a, b, c, gap, at = dr.while_loop(state, lambda number, *_: number < most, attempt, label="directions of planes")
+    _, a, b, c, gap, at = dr.while_loop(state, lambda number, *_: number < most, attempt, label="directions of planes")
     # from the plane to a line in the image and its speed; a plane across the axis of time is no line
     length = dr.sqrt(a * a + b * b)
     is_line = abs(c) <= _FASTEST_PX * length
