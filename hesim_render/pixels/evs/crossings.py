@@ -99,6 +99,12 @@ def level_at(
     return np.asarray(low + (t_us - times_us[line]) / np.diff(times_us)[line] * (high - low))
 
 
+def listed(needed: NDArray[np.bool_], due: DueEvents) -> NDArray[np.uint32]:
+    """Numbers of the pixels that are needed or have a due event, in rising order; `needed` is changed in place."""
+    needed[due[1]] = True
+    return np.flatnonzero(needed).astype(np.uint32)
+
+
 def of_pixels(due: DueEvents, pixel: NDArray[np.uint32]) -> DueEvents:
     """Those of some pixels."""
     own = np.isin(due[1], pixel)

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
 from hesim_render.core.rng import Stream
+from hesim_render.core.tables import spread_out
 from hesim_render.pixels.arrays import take
-from hesim_render.pixels.evs.crossings import DueEvents, events_on_paths, of_pixels
+from hesim_render.pixels.evs.crossings import DueEvents, events_on_paths, listed, of_pixels
 from hesim_render.pixels.evs.defects import DefectEvents
 from hesim_render.pixels.evs.events import Origin, events_at, no_events
 from hesim_render.pixels.evs.leak_drift import LeakDrift
@@ -28,8 +29,8 @@ _SETTLING_PERIODS = 4
 
 #: Share of a threshold by which a level must stay below it to count as far from it: rounding is smaller.
 _MARGIN_REL = 1e-4
-#: Pixels whose paths are on the host at a time.
-_PATHS = 1 << 16
+#: Pixels that are followed at a time.
+_PATHS = 1 << 18
 #: Processes of events at random times: the polarity times the `Origin` of their events, and their random numbers.
 _RANDOM = {
     int(Origin.LEAK): Stream.EVS_LEAK,
@@ -264,43 +265,51 @@ class LastEvent:
         near = (above >= on) | (below <= -off)
         if self._refractory:
             near = self._refractory.may_fire(near, nodes_us[0], nodes_us[-1])
-        dr.eval(level, first, last, near)
+        dr.eval(level, first, last, near, on, off)
         before, self.level = self.level, level
-        every = np.union1d(np.flatnonzero(near.numpy()), due[1]).astype(np.uint32)
+        every = listed(np.array(near), due)
+        is_due = np.zeros(self._pixels, np.bool_)
+        is_due[due[1]] = True
         parts = [no_events()]
         for pixel in np.split(every, range(_PATHS, every.size, _PATHS)) if every.size else ():
             index = types.UInt32(pixel)
-            curve = low_pass.along(begin, end.log, index, times_us[1:])
-            theta = [take(values, index) for values in self._noise.on_device.thresholds]
-            gathered = [take(values, index) for values in (before, first, last, self.reference)]
-            dr.eval(curve, theta, gathered)
-            start, low, high, own, on_host, off_host = (np.array(values) for values in (*gathered, *theta))
-            share = ((times_us[1:] - times_us[0]) / (times_us[-1] - times_us[0])).astype(np.float32)[:, None]
-            paths = np.concatenate([start[None], np.array(curve).reshape(-1, pixel.size) + low + share * (high - low)])
-            given = due if every.size == pixel.size else of_pixels(due, pixel)
-            reference, t_us, fired, polarity = self._on_paths(pixel, paths, times_us, own, (on_host, off_host), given)
-            dr.scatter(self.reference, types.Float(reference.astype(np.float32)), index)
-            parts.append(events_at(self._stamp(t_us), fired, polarity, self._cols))
+            line = take(first, index), take(last, index)
+            curve, least, most = low_pass.along(begin, end.log, index, times_us[1:], line)
+            own = take(self.reference, index)
+            crosses = (most - own >= take(on, index)) | (least - own <= -take(off, index))
+            if self._refractory:
+                crosses = self._refractory.may_fire(crosses, nodes_us[0], nodes_us[-1], index)
+            dr.eval(curve, crosses)
+            # only paths with an event or a new reference go to the host
+            kept = np.flatnonzero(np.array(crosses) | is_due[pixel]).astype(np.uint32)
+            if kept.size:
+                start = np.array(take(before, types.UInt32(pixel[kept])))
+                followed = np.array(_columns(curve, kept, pixel.size, len(times_us) - 1)).reshape(-1, kept.size)
+                paths = np.concatenate([start[None], followed])
+                parts.append(self._events_on_paths(pixel[kept], paths, times_us, due))
         dr.eval(self.reference)
         return np.concatenate(parts)
 
-    def _on_paths(
-        self,
-        pixel: NDArray[np.uint32],
-        paths: NDArray[np.float32],
-        times_us: NDArray[np.float64],
-        reference: NDArray[np.float32],
-        thresholds: tuple[NDArray[np.float32], NDArray[np.float32]],
-        due: DueEvents,
-    ) -> tuple[NDArray[np.float64], NDArray, NDArray, NDArray]:
-        """New references of some pixels, and their events; see `events_on_paths`."""
-        own = reference.astype(np.float64)
-        on, off = (np.broadcast_to(theta, own.shape).astype(np.float64) for theta in thresholds)
+    def _events_on_paths(
+        self, pixel: NDArray[np.uint32], paths: NDArray[np.float32], times_us: NDArray[np.float64], due: DueEvents
+    ) -> NDArray[np.void]:
+        """Events of some pixels, whose references go on with them; see `events_on_paths`."""
+        import drjit as dr
+
+        types = jit()
+        index = types.UInt32(pixel)
+        own = np.array(take(self.reference, index)).astype(np.float64)
+        on, off = (
+            np.broadcast_to(np.array(take(theta, index)), own.shape).astype(np.float64)
+            for theta in self._noise.on_device.thresholds
+        )
+        given = pixel, paths, times_us, own, (on, off), of_pixels(due, pixel)
         if self._refractory:
-            return self._refractory.crossings_on_curves(pixel, paths, times_us, own, (on, off), due)
-        awake = np.full(own.size, LONG_AGO_US)
-        own, _, t_us, fired, polarity = events_on_paths(pixel, paths, times_us, own, (on, off), due, awake, None)
-        return own, t_us, fired, polarity
+            own, t_us, fired, polarity = self._refractory.crossings_on_curves(*given)
+        else:
+            own, _, t_us, fired, polarity = events_on_paths(*given, np.full(own.size, LONG_AGO_US), None)
+        dr.scatter(self.reference, types.Float(own.astype(np.float32)), index)
+        return events_at(self._stamp(t_us), fired, polarity, self._cols)
 
     def _due(self, begin_us: float, end_us: float) -> DueEvents:
         """Leak events, events of comparators and of defects of one segment, where pixels rest after them."""
@@ -318,3 +327,14 @@ class LastEvent:
         # leaks and defects end or lengthen dead times, so that all events are taken together
         t_us, pixel = (np.concatenate(values) for values in zip(*due, strict=True))
         return t_us, pixel, np.concatenate(origins)
+
+
+def _columns(values: Float, chosen: NDArray[np.uint32], columns: int, rows: int) -> Float:
+    """Some columns of a table that is stored row by row."""
+    import drjit as dr
+
+    types = jit()
+    entry, width = dr.arange(types.UInt32, rows * chosen.size), dr.opaque(types.UInt32, chosen.size)
+    row = entry // width
+    column = spread_out(types.UInt32, chosen, entry - row * width)
+    return dr.gather(types.Float, values, row * dr.opaque(types.UInt32, columns) + column)

@@ -154,8 +154,10 @@ class Photoreceptor:
         """The filter at the present, from which `to` goes on."""
         return Instant(self._t_us, self._input, *self._state)
 
-    def along(self, begin: Instant, log: Float, pixel: UInt32, times_us: NDArray[np.float64]) -> Float:
-        """y of some pixels at some times, if ln x goes on a straight line from `begin` to `log`.
+    def along(
+        self, begin: Instant, log: Float, pixel: UInt32, times_us: NDArray[np.float64], line: tuple[Float, Float]
+    ) -> tuple[Float, Float, Float]:
+        """y of some pixels at some times, if ln x goes on a straight line from `begin` to `log`, plus another line.
 
         Parameters
         ----------
@@ -163,10 +165,12 @@ class Photoreceptor:
         log : ln x of each pixel at the end of the line, the last of the times.
         pixel : [n], numbers of the pixels.
         times_us : [nodes], µs, rising, all after `begin`.
+        line : what is added at the begin and at the last of the times, [n] each.
 
         Returns
         -------
-        [nodes · n], the pixels of a node side by side.
+        levels : [nodes · n], the pixels of a node side by side.
+        least, most : of the levels of each pixel, [n].
         """
         import drjit as dr
 
@@ -180,16 +184,29 @@ class Photoreceptor:
         lane, lanes = dr.arange(types.UInt32, dr.width(pixel)), dr.opaque(types.UInt32, dr.width(pixel))
         nodes, result = dr.opaque(types.UInt32, count), dr.empty(types.Float, count * dr.width(pixel))
 
-        def step(node: UInt32, level: Float, z: Float, y: Float) -> tuple[UInt32, Float, Float, Float]:
-            following = dr.fma(after - before, dr.gather(types.Float, parts, node), before)
-            elapsed = dr.gather(types.Float, elapsed_us, node)
-            z, y = self._stepped((z, y), level, following - level, elapsed, pixels)
-            dr.scatter(result, following + y, node * lanes + lane)
-            return node + 1, following, z, y
+        first_added, last_added = line
 
-        first = dr.zeros(types.UInt32, dr.width(pixel))
-        dr.while_loop((first, before, z, y), lambda node, *_: node < nodes, step, label="photoreceptor nodes")
-        return result
+        def step(
+            node: UInt32, log: Float, z: Float, y: Float, least: Float, most: Float
+        ) -> tuple[UInt32, Float, Float, Float, Float, Float]:
+            part = dr.gather(types.Float, parts, node)
+            following = dr.fma(after - before, part, before)
+            z, y = self._stepped((z, y), log, following - log, dr.gather(types.Float, elapsed_us, node), pixels)
+            level = following + y + first_added + part * (last_added - first_added)
+            dr.scatter(result, level, node * lanes + lane)
+            return node + 1, following, z, y, dr.minimum(least, level), dr.maximum(most, level)
+
+        n = dr.width(pixel)
+        start = (
+            dr.zeros(types.UInt32, n),
+            before,
+            z,
+            y,
+            dr.full(types.Float, np.inf, n),
+            dr.full(types.Float, -np.inf, n),
+        )
+        *_, least, most = dr.while_loop(start, lambda node, *_: node < nodes, step, label="photoreceptor nodes")
+        return result, least, most
 
     def _stepped(self, state: _State, begin: Float, change: Float, elapsed_us: Float, pixels: EventPixels) -> _State:
         """State at the end of a line, with the corner of the light at each instant of it.

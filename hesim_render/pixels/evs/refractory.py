@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
-from hesim_render.core.device_types import Float, Mask
+from hesim_render.core.device_types import Float, Mask, UInt32
 from hesim_render.pixels.arrays import take
-from hesim_render.pixels.evs.crossings import DueEvents, events_on_paths, level_at
+from hesim_render.pixels.evs.crossings import DueEvents, events_on_paths, level_at, listed
 
 #: Before any time, µs.
 LONG_AGO_US = -1e18
@@ -79,7 +79,7 @@ class Refractory:
         hit = awake & ((distance >= theta_on) | (distance <= -theta_off))
         dr.eval(reference, hit)
         # only pixels that cross, or leak, go to the host, where each may have several events
-        result = np.union1d(np.flatnonzero(hit.numpy()), due[1]).astype(np.uint32)
+        result = listed(np.array(hit), due)
         if result.size == 0:
             return reference, *(np.empty(0, kind) for kind in (np.float64, np.uint32, np.float64))
         pixel = types.UInt32(result)
@@ -118,13 +118,20 @@ class Refractory:
         dr.eval(self._ready_us)
         return own, t_us, fired, polarity
 
-    def may_fire(self, crosses: Mask, begin_us: float, end_us: float) -> Mask:
+    def may_fire(self, crosses: Mask, begin_us: float, end_us: float, pixel: UInt32 | None = None) -> Mask:
         """True where a pixel may have an event or a new reference up to `end_us`, of those whose level may cross.
 
         Pixels that are dead all the time have neither. Those that are released on the way get a new reference.
+
+        Parameters
+        ----------
+        crosses : of all pixels, or of those listed.
+        begin_us, end_us : µs.
+        pixel : their numbers; None for all.
         """
         import drjit as dr
 
         types = jit()
-        awake = self._ready_us <= dr.opaque(types.Float64, end_us)
-        return awake & (crosses | (self._ready_us > dr.opaque(types.Float64, begin_us)))
+        ready = self._ready_us if pixel is None else take(self._ready_us, pixel)
+        awake = ready <= dr.opaque(types.Float64, end_us)
+        return awake & (crosses | (ready > dr.opaque(types.Float64, begin_us)))
