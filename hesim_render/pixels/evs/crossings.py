@@ -35,7 +35,7 @@ def events_on_paths(
     times_us : [nodes], their times, µs.
     reference : [n], levels with which the pixels compare; of those that are released on the way, that of the release.
     thresholds : θ₊, θ₋, [n] each.
-    due : any number of each pixel; without a dead time there are none.
+    due : any number of each pixel, of other pixels as well; without a dead time there are none.
     ready_us : [n], ends of the dead times, µs.
     period_us : dead time, µs; None for none.
 
@@ -103,9 +103,3 @@ def listed(needed: NDArray[np.bool_], due: DueEvents) -> NDArray[np.uint32]:
     """Numbers of the pixels that are needed or have a due event, in rising order; `needed` is changed in place."""
     needed[due[1]] = True
     return np.flatnonzero(needed).astype(np.uint32)
-
-
-def of_pixels(due: DueEvents, pixel: NDArray[np.uint32]) -> DueEvents:
-    """Those of some pixels."""
-    own = np.isin(due[1], pixel)
-    return due[0][own], due[1][own], due[2][own]

@@ -13,7 +13,7 @@ from hesim_render.core.device_types import Float
 from hesim_render.core.rng import Stream
 from hesim_render.core.tables import spread_out
 from hesim_render.pixels.arrays import take
-from hesim_render.pixels.evs.crossings import DueEvents, events_on_paths, listed, of_pixels
+from hesim_render.pixels.evs.crossings import DueEvents, events_on_paths, listed
 from hesim_render.pixels.evs.defects import DefectEvents
 from hesim_render.pixels.evs.events import Origin, events_at, no_events
 from hesim_render.pixels.evs.leak_drift import LeakDrift
@@ -303,7 +303,7 @@ class LastEvent:
             np.broadcast_to(np.array(take(theta, index)), own.shape).astype(np.float64)
             for theta in self._noise.on_device.thresholds
         )
-        given = pixel, paths, times_us, own, (on, off), of_pixels(due, pixel)
+        given = pixel, paths, times_us, own, (on, off), due
         if self._refractory:
             own, t_us, fired, polarity = self._refractory.crossings_on_curves(*given)
         else:
