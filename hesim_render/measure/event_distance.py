@@ -129,7 +129,7 @@ def _part(
 
 
 #: Draws of the bootstrap, and hot pixels: so many times the usual rate.
-_DRAWS, _HOT = 200, 10.0
+_DRAWS, _SEED, _HOT = 200, 1, 10.0
 _Draw = NDArray[np.intp]
 
 
@@ -167,13 +167,12 @@ class EventDistance:
         }  # fmt: skip
 
 
-def event_distances(first: EventStatistics, second: EventStatistics, seed: int = 1) -> list[EventDistance]:
+def event_distances(first: EventStatistics, second: EventStatistics) -> list[EventDistance]:
     """All distances of two streams.
 
     Parameters
     ----------
     first, second : statistics of the streams, from `event_statistics`.
-    seed : of the bootstrap.
 
     Raises
     ------
@@ -185,7 +184,7 @@ def event_distances(first: EventStatistics, second: EventStatistics, seed: int =
         raise SpecError(
             f"is of {cols}x{rows} px; expected {own_cols}x{own_rows}, as {first.source}", file=second.source
         )
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
     draws = rng.integers(0, PARTS, (3, _DRAWS, PARTS))
     whole = np.arange(PARTS)
     result = []

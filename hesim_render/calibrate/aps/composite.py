@@ -18,6 +18,8 @@ from hesim_render.spectral import spectrum as spectra
 _CLEAR_SIGMAS = 6.0
 #: Relative standard deviation of the frame pixels around an event pixel above which its signal is uncertain.
 _UNEVEN = 0.1
+#: σ of the Gaussian that interpolates, px; it is widened where no frame pixel is near.
+_SIGMA_PX = 1.0
 #: Factor of their noise variance by which a few of them may scatter.
 _NOISE_MARGIN = 3.0
 
@@ -117,7 +119,7 @@ def compose(lit: FrameMoments, dark: DarkModel, usable: NDArray[np.bool_], beta:
 
 
 def signal_at_event_pixels(
-    composite: Composite, sensor: SensorSpec, illuminant: str | None = None, sigma_px: float = 1.0
+    composite: Composite, sensor: SensorSpec, illuminant: str | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Composite at the event pixels, on the event grid [y, x], DN/s, and where it is not to be relied on.
 
@@ -160,7 +162,7 @@ def signal_at_event_pixels(
             for (a, b), ratio in _like_it(sensor, pixel.filter, illuminant).items():
                 cut = np.s_[a::height, b::width]
                 scaled[cut], noise[cut] = ratio * rate_dn_per_s[cut], ratio * error[cut]
-            values, differ = (v[i::height, j::width] for v in _smoothed(scaled, noise, sigma_px, max(height, width)))
+            values, differ = (v[i::height, j::width] for v in _smoothed(scaled, noise, _SIGMA_PX, max(height, width)))
         a, b = divmod(k, grid.cols_per_tile)
         signal[a :: grid.rows_per_tile, b :: grid.cols_per_tile] = values
         uneven[a :: grid.rows_per_tile, b :: grid.cols_per_tile] = differ
