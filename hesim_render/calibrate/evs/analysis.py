@@ -83,6 +83,7 @@ def analyse(
     """
     tell = progress or (lambda what, fraction: None)
     theta_v = captures.spec.theta_hardware_v or 1.0
+    # pixels that no threshold explains would outweigh the others by their counts
     bad = bad_event_pixels(static)
     good = ~bad
     if good.mean() < 0.5:
@@ -91,6 +92,7 @@ def analyse(
         )
     _check_brightness(static, good, captures)
     tell("fitting", 0.2)
+    # a first fit to medians, which bad pixels hardly affect, starts all later ones
     typical = Typical.of(static, good)
     begun = {law: best_start(typical.cells, theta_v, law) for law in _LAWS}
     starts = {law: parameters for law, (parameters, _, _) in begun.items()}
@@ -118,21 +120,25 @@ def analyse(
         if thresholds is not None:
             spread, known = thresholds.spread, thresholds.of_pixels()
         else:
+            # without steps, the scatter of the counts over pixels tells how far their thresholds differ
             plain = pool_events(static, good, PixelThresholds.unknown(good.shape, 0.0))
             alone = alone or static_mismatch(plain, typical)
             spread, known = alone, PixelThresholds.unknown(good.shape, alone.value)
+        # counts in cells of like brightness and threshold, which the fit describes
         pixels = pool_events(static, good, known)
         if turn < 2:
             laws = {law: fit_events(pixels, theta_v, law, starts[law]) for law in wanted}
         else:
             law = _likelier(laws)
             laws[law] = fit_events(pixels, theta_v, law, laws[law].whole * _SYMMETRIC)
+    # means of widely spread counts tell the two laws apart less well than medians do
     law = by_medians if thresholds is None and spread.value > 0 else _likelier(laws)
     fit, others = laws[law], [other for name, other in laws.items() if name != law]
     advantage = _advantage(fit, others[0]) if others else abs(lead)
     _check_fit(fit, captures)
     best = with_mismatch_error(fit, pixels, theta_v, spread.relative_error)
     tell("fitting positions", 0.6)
+    # each tile position by itself, from the parameters of all together
     fits = [
         fit_events(pool_events(static, good, known, k), theta_v, law, best.parameters, best.free)
         for k in range(static.tile[0] * static.tile[1])
@@ -142,6 +148,7 @@ def analyse(
     if thresholds is not None:
         best, *fits = (_with_sampling_error(fit, thresholds, good) for fit in (best, *fits))
     tell("200 starts", 0.8)
+    # many searches from random starts must end where this one did
     averaged = pool_events(static, good, PixelThresholds.unknown(good.shape, spread.value))
     ends = multi_start(averaged if thresholds is None else pixels, best, theta_v, seed)
     return EvsCalibration(
@@ -251,6 +258,7 @@ def step_in_ln(captures: CaptureSet, steps: Steps, fit: EventFit) -> NDArray[np.
         return steps.contrast
     if not (fit.identified("A") and fit.identified("B")):
         return None
+    # the same change of the signal as one of the voltage, whose offset makes it smaller
     k = coefficients(from_natural(fit.values))
     return np.log(voltage(k, steps.signal_dn * np.exp(steps.contrast)) / voltage(k, steps.signal_dn))
 
@@ -268,6 +276,7 @@ def bootstrap_errors(result: EvsCalibration, samples: int, seed: int) -> NDArray
     good, fit = ~result.bad, result.together
     values = []
     for _ in range(samples):
+        # a Poisson number of copies of each pixel is a resampling of all
         weight = rng.poisson(1.0, good.shape)
         pixels = pool_events(result.static, good & (weight > 0), result.known, None, weight)
         values.append(fit_events(pixels, result.theta_v, fit.law, fit.parameters, fit.free).values[:4])
