@@ -79,6 +79,7 @@ def event_statistics(stream: EventStream) -> EventStatistics:
         raise SpecError(problem, file=stream.source)
     rows, cols = stream.shape
     result: list[tuple[NDArray, ...]] = []
+    # blocks of the file are cut at the ends of parts: only what belongs to the next part is held
     held, last_us = [no_events()], np.full(rows * cols, -1, np.int64)
     for events in (*stream, no_events()):
         held.append(events)
@@ -107,18 +108,23 @@ def _part(
     pixel = y * cols + x
     on = np.count_nonzero(events["polarity"] > 0)
     count = np.bincount(pixel, minlength=rows * cols).astype(np.uint32)
+    # events in successive windows; the rest of the part after the last whole one is left out
     series = np.bincount(t_us // WINDOW_US, minlength=part_us // WINDOW_US)[: part_us // WINDOW_US]
+    # by pixel, then by time: the interval before each event, for the first one of a pixel from the part before
     order = np.argsort(pixel, kind="stable")
     own, times = pixel[order], t_us[order] + begin_us
     first = np.diff(own, prepend=-1) != 0
     before_us = np.where(first, last_us[own], np.append(0, times[:-1])[: own.size])
     gap = (times - before_us)[before_us >= 0]
     intervals = np.histogram(np.maximum(gap, 1), INTERVALS_US)[0]
+    # the last event of each pixel, for the next part
     ends = np.append(first[1:], True)[: own.size]
     last_us[own[ends]] = times[ends]
+    # bursts: successive events of a pixel without a long gap, counted by their lengths
     starts = np.flatnonzero(first | (times - before_us > GAP_US))
     length = np.diff(np.append(starts, own.size))
     bursts = np.bincount(np.minimum(length, LONGEST), minlength=LONGEST + 1)
+    # pixels active in a window, each once; with each neighbour, the windows in which both are
     key = np.unique((t_us // ACTIVE_US) * (rows * cols) + pixel)
     row, col = np.divmod(key % (rows * cols), cols)
     active = [int(key.size)]
@@ -185,6 +191,7 @@ def event_distances(first: EventStatistics, second: EventStatistics) -> list[Eve
             f"is of {cols}x{rows} px; expected {own_cols}x{own_rows}, as {first.source}", file=second.source
         )
     rng = np.random.default_rng(_SEED)
+    # the parts of a stream, drawn with replacement: twice of the first, once of the second
     draws = rng.integers(0, PARTS, (3, _DRAWS, PARTS))
     whole = np.arange(PARTS)
     result = []
@@ -236,6 +243,7 @@ def _over_time(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
     series = one.series[draw].astype(np.float64)
     series = series - series.mean()
     variance = np.mean(series**2)
+    # within a part only; lags longer than one have no correlation
     lags = [lag for lag in LAGS if lag < series.shape[1]]
     result = [np.mean(series[:, lag:] * series[:, :-lag]) / max(variance, 1e-300) for lag in lags]
     return np.array(result + [0.0] * (len(LAGS) - len(lags)))
@@ -245,6 +253,7 @@ def _over_space(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
     active = one.active[draw].sum(axis=0).astype(np.float64)
     rows, cols = one.shape
     windows = one.windows * len(draw)
+    # correlation of the activity of two pixels: joint share less the product of both, over the variance of one
     share = active[0] / (windows * rows * cols)
     pairs = np.array([(rows - down) * (cols - right) for down, right in NEIGHBOURS], np.float64)
     both = active[1:] / (windows * np.maximum(pairs, 1.0))
@@ -253,6 +262,7 @@ def _over_space(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
 
 def _hot(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
     count = one.pixels[draw].sum(axis=0)
+    # the mean of nine tenths of the pixels, which hot ones do not raise
     usual = np.sort(count)[: max(1, round(0.9 * count.size))].mean() + 1 / count.size
     return np.array([np.mean(count > np.maximum(_HOT * usual, 3.0))])
 
