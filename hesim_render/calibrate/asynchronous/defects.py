@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 from scipy.stats import poisson
 
 from hesim_render.calibrate.asynchronous.fit import Fit
-from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, THETA, TrialCounts, chances, log_prior
+from hesim_render.calibrate.asynchronous.likelihood import TrialCounts, chances
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
 from hesim_render.calibrate.flicker import dynamics, unsteady
 from hesim_render.calibration.rates import rate_hz
@@ -84,20 +83,19 @@ def _tests(fit: Fit, steady: Trials, steps: Trials, polarity: int) -> NDArray[np
     k = 0 if polarity > 0 else 1
     grid = fit.likelihood.grids[k]
     counts = TrialCounts.of([steps], polarity)
-    log = counts.log_likelihood(fit.values, grid, fit.law)
-    log += log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid)
-    weight = np.exp(log - logsumexp(log, axis=1, keepdims=True))
+    # what the S-curve of each pixel leaves of the grid of thresholds, [pixel, threshold]
+    weight = fit.law_given(counts)
     chance = chances(fit.values, counts.sets[0], polarity, grid, fit.law).sum(axis=1)  # [kind, threshold]
-    events = counts.events.reshape(log.shape[0], chance.shape[0], -1).sum(axis=2)
+    events = counts.events.reshape(weight.shape[0], chance.shape[0], -1).sum(axis=2)
     trials = events + counts.silent
     sure, never = chance > 1 - _SURE, chance < _SURE
     quiet = TrialCounts.of([steady], polarity)
     seen = quiet.events.sum(axis=1, keepdims=True)
     usual = chances(fit.values, quiet.sets[0], polarity, grid, fit.law).sum(axis=1)
     bins = len(steady.edges_s) - 1
-    own = quiet.events.reshape(log.shape[0], -1, bins).sum(axis=2) + quiet.silent
+    own = quiet.events.reshape(weight.shape[0], -1, bins).sum(axis=2) + quiet.silent
     tests = (
-        (np.broadcast_to(seen, log.shape), own @ usual),
+        (np.broadcast_to(seen, weight.shape), own @ usual),
         (counts.silent @ sure, trials @ (sure * (1 - chance))),
         (events @ never, trials @ (never * chance)),
     )
