@@ -29,7 +29,7 @@ INTERVALS_US = 10 ** np.linspace(0.0, 8.0, 161)
 WINDOW_US, LAGS = 1000, (1, 2, 4, 8, 16, 32)
 #: Windows in which pixels count as active, µs, and the neighbours whose activity is compared: rows and columns away.
 ACTIVE_US, NEIGHBOURS = 5000, ((0, 1), (1, 0), (0, 2), (2, 0))
-#: Longest gap within a burst, µs, and longest burst that is told apart.
+#: Longest gap within a burst, µs, and longest burst that is distinguished.
 GAP_US, LONGEST = 1000, 64
 _LEAST_EVENTS, _LEAST_PART_US = 100 * PARTS, 2 * WINDOW_US
 

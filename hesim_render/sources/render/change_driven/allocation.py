@@ -66,7 +66,7 @@ def allocate(
     highest, lowest = around.max(axis=0), around.min(axis=0)
     contrast = np.maximum(sites.most(highest, 1) - value, value + sites.most(-lowest, 1))
     unseen = np.float32(tuning.unseen_area**0.5) * contrast
-    # if a neighbour sees light that is hidden here, part of it may be visible here too
+    # if a neighbour sees light that is occluded here, part of it may be visible here too
     is_light_near = sites.most(flux > np.float32(1e-6) * open_flux, REACH)
     brighter = np.maximum(sites.most(highest, 2) - value, np.where(is_light_near, open_flux[here] - value, 0))
     # rays for what the pilot may have missed: an edge that covers `unseen_area` of the pixel, or light beside it
@@ -78,7 +78,7 @@ def allocate(
     wanted = np.maximum(wanted, np.minimum(for_unseen, np.float32(tuning.most_unseen_rays)))
     looked = None
     if pilot.refined:
-        # With fewer rays than the closer look, a single ray could hit the small object and weigh far too much.
+        # With fewer rays than the refinement took, a single ray could hit the small object and weigh far too much.
         looked = np.zeros(sites.size, np.float32)
         np.maximum.at(looked, pilot.refined[window].place, pilot.refined[window].rays.astype(np.float32))
         wanted = np.maximum(wanted, looked[here])
@@ -86,7 +86,7 @@ def allocate(
     # number
     heavy = np.float32(tuning.ray_weight) * wanted_error
     wanted = np.maximum(wanted, open_flux[here] / heavy)
-    # light that is hidden from all pilot rays may still come through a gap
+    # light that is occluded for all pilot rays may still come through a gap
     floor = np.maximum(np.zeros_like(value) if looked is None else looked[here], (open_flux[here] - value) / heavy)
     # to the nearest power of two, so that stratified sequences are used whole
     bits = np.rint(np.log2(np.clip(wanted, tuning.least_rays, tuning.most_rays))).astype(np.int16)

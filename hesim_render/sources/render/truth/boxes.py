@@ -27,7 +27,7 @@ class Boxes:
     names : names of the objects, without the background.
     visible_px : [object, 4], left, top, right, bottom of the pixels that show the object, in px of the grid: borders of
         pixels, so that one pixel at (0, 0) has −0.5, −0.5, 0.5, 0.5. NaN where none shows it.
-    whole_px : [object, 4], the same of the whole object, hidden parts and parts beside the picture included, exact for
+    whole_px : [object, 4], the same of the whole object, occluded parts and parts beside the picture included, exact for
         meshes and spheres and of the box in space for other shapes; NaN if a part of it is not in front of the camera.
         With a rolling shutter, at the time of the middle row.
     corners_m : [object, 8, 3], corners of the box in space, world, m. It is parallel to the world's axes while the

@@ -236,7 +236,7 @@ class ChiefRays:
 
         Returns
         -------
-        [n]; surfaces within the last 1e-4 of the way do not hide a point.
+        [n]; surfaces within the last 1e-4 of the way do not occlude a point.
         """
         way = points - origin
         length = np.linalg.norm(way, axis=1)
