@@ -94,7 +94,7 @@ class NominalSteps:
         farthest = sign[ends] * after[ends]
         farthest[goes_on] = np.maximum(farthest[goes_on], (sign[ends] * level[pixel[ends]])[goes_on])
 
-        # steps of earlier samples wait on: how far the level has gone for them follows from the first run of their pixel.
+        # steps of earlier samples wait on: how far the level has gone for them is in the first run of their pixel.
         # Where that runs the other way, the pixel has stepped back, and the goal is out of reach.
         before = self._waiting
         first_run = np.full(self._own.shape[1], -1)
