@@ -147,15 +147,18 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
         With file and line, if the captures are saturated, clipped at 0, or lit by light that drifts.
     """
     require_memory(_BYTES_PER_PIXEL * pairs.shape[0] * pairs.shape[1], "maps and transforms of a frame", pairs.file)
+    # mean and temporal variance of every level, from pairs of frames; where they saturate the variance falls again
     lit, dark = both_levels(pairs, progress)
     signal, light = lit.mean - dark.mean, light_of(pairs, lit)
     saturation = _saturation(lit)
+    # of several long series, the one that the standard asks for
     pairs = pairs.with_long_at(_LONG_AT * float(light[min(saturation, light.size - 1)]))
     long_dark, long_lit = long_series(pairs, progress)
     _check_dark(pairs, dark, long_dark)
     _check_long(pairs, long_lit, lit, saturation)
     _check_mosaic(pairs, long_lit.mean - long_dark.mean)
     top = float(signal[min(saturation, signal.size - 1)])
+    # levels of whose variance nothing is cut off
     clear = lit.clear & (np.arange(signal.size) < saturation) & (signal > 0)
     if clear.sum() < _FEWEST_CLEAR:
         last = pairs.lit[min(int(clear.sum()), signal.size - 1)]
@@ -167,6 +170,7 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     if light[clear].min() == light[clear].max():
         raise pairs.lit[0].error("all lit pairs have one light; EMVA 1288 needs many, up to saturation")
     row, col = _shared(dark, long_dark)
+    # photon transfer: K is the slope of the variance above the dark against the signal
     use = clear & (signal <= _FIT_TOP * top)
     difference = lit.variance - dark.variance
     gain = through_origin(signal[use], difference[use], _difference_covariance(pairs, lit, dark, use))
@@ -174,17 +178,23 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
         raise SpecError(
             "the variance does not rise with the light; no gain follows from these captures", file=pairs.file
         )
+    # responsivity: the slope of the signal against the light, with errors from its own scatter
     responsivity = through_origin(light[use], signal[use], None)
+    # a level is the mean of two frames of all pixels: its error is what rows share, and the noise of the pixels
     shared_error = np.sqrt((max(row[0], 0.0) + long_dark.temporal.pixel / pairs.shape[1]) / pairs.shape[0] / 2)
     distinct = np.unique(dark.exposure_s, return_index=True)[1]
+    # dark current and dark noise: straight lines against the exposure
     black = straight(dark.exposure_s[distinct], dark.mean[distinct], np.full(distinct.size, max(shared_error, 1e-6)))
     noise = straight(dark.exposure_s[distinct], dark.variance[distinct], dark.error[distinct])
+    # beyond the standard: the curve bends, and light may be more than stated
     curve = mean_curve(light[clear], signal[clear], np.full(int(clear.sum()), np.hypot(shared_error, black.rms)))
     _check_light(pairs, curve, light, signal, clear)
+    # the variance as a polynomial, with errors that include the scatter of whole levels
     bins = _bins(pairs, lit, dark, signal, clear, distinct)
     fit = _variance_fit(bins)
     level_chi2, level_chance, level_rms = _scatter(pairs, lit, signal, clear, fit)
     fit = _widened(fit, level_chi2)
+    # fixed patterns from the long series, without the noise of their means; pixels unlike the others are defects
     dark_pattern = pattern_of(long_dark.mean, long_dark.spatial.noise, long_dark.spectrum, long_dark.frames)
     relative, relative_noise = _relative(long_lit, long_dark, curve, light[clear])
     light_pattern = pattern_of(relative, relative_noise)
@@ -221,6 +231,7 @@ def _check_long(pairs: PairSet, long_lit: Long, lit: Levels, saturation: int) ->
 def _check_mosaic(pairs: PairSet, signal: NDArray) -> None:
     """Refuse frames whose places of a 2x2 tile have signals of their own, far apart beside the pixels' spread."""
     rows, cols = (count - count % 2 for count in signal.shape)
+    # the four places of a tile, [place, pixel]
     places = signal[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2).transpose(1, 3, 0, 2).reshape(4, -1)
     middle = np.median(places, axis=1)
     spread = np.median(np.abs(places - middle[:, None])) / 0.6745
@@ -270,6 +281,7 @@ def _shared(dark: Levels, long_dark: Long) -> tuple[tuple[float, float], tuple[f
 def _difference_covariance(pairs: PairSet, lit: Levels, dark: Levels, use: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Covariance of lit less dark variances; levels that have one dark pair share its error."""
     numbers = np.flatnonzero(use)
+    # a dark pair that serves several levels moves them together
     same = np.array([[pairs.dark[i] is pairs.dark[j] for j in numbers] for i in numbers])
     return np.diag(lit.error[use] ** 2) + same * np.outer(dark.error[use], dark.error[use])
 
@@ -279,6 +291,7 @@ def _bins(
 ) -> Pooled:
     """One bin a pair for the fit of the variance polynomial."""
     pixels = float(pairs.shape[0] * pairs.shape[1])
+    # each dark pair once, then the lit ones; sums are those of pixels that all have the mean signal of the level
     light = np.concatenate([np.zeros(distinct.size), signal[clear]])
     variance = np.concatenate([dark.variance[distinct], lit.variance[clear]]) - ADC_VARIANCE_DN2
     raw = np.concatenate([dark.squares[distinct], lit.squares[clear]])
@@ -339,9 +352,11 @@ def _relative(
     expected = pattern_of(dark.mean, dark.spatial.noise, dark.spectrum, dark.frames, expected=True)
     signal = lit.mean - dark.mean.mean() - expected.whole
     level = float(signal.mean())
+    # the light at which the curve gives the mean signal of the series, by a table
     places = np.linspace(float(light.min()), float(light.max()), 512)
     here = float(np.interp(level, curve.at(places), places))
     shifted = here + curve.offset
+    # signal ∝ lightᵉ about there: e is 1 where the curve is straight
     exponent = float(curve.gradient(np.array([here]))[0, 0]) * shifted / float(curve.at(np.array([here]))[0])
     scale = level * exponent
     # of the dark pattern that part is unknown which is as large as what is known of its noise
