@@ -24,7 +24,13 @@ from hesim_render.calibrate.aps.light_curve import (
 )
 from hesim_render.calibrate.aps.long_series import Long, long_series, stuck_pixels
 from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
-from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, Levels, both_levels
+from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, Levels, both_levels
+from hesim_render.calibrate.aps.pairs_required import (
+    require_dark_noise,
+    require_one_colour,
+    require_series_below_well,
+    require_steady_light,
+)
 from hesim_render.calibrate.aps.spatial import Pattern, outliers, pattern_of
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance
 from hesim_render.calibrate.moments import Progress
@@ -39,12 +45,6 @@ _FIT_TOP = 0.7
 _LONG_AT = 0.5
 #: Dark variance as measured, DN², below which EMVA 1288 gives the dark noise no value but a limit, and that limit, DN.
 _LEAST_DARK_DN2, DARK_NOISE_LIMIT_DN = 0.24, 0.49
-#: Scatter of the light from exposure to exposure that is refused.
-_MOST_SCATTER = MOST_CHANGE
-#: Relative differences of the places of a tile from which they are colours.
-_MOSAIC = 0.08
-#: Part of the largest temporal variance below which a brighter series is at the full well.
-_WELL_PART = 0.5
 _FEWEST_CLEAR = 5
 #: Memory of an evaluation, most of it transforms of frames in double precision.
 _BYTES_PER_PIXEL = 200
@@ -154,9 +154,9 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     # of several long series, the one that the standard asks for
     pairs = pairs.with_long_at(_LONG_AT * float(light[min(saturation, light.size - 1)]))
     long_dark, long_lit = long_series(pairs, progress)
-    _check_dark(pairs, dark, long_dark)
-    _check_long(pairs, long_lit, lit, saturation)
-    _check_mosaic(pairs, long_lit.mean - long_dark.mean)
+    require_dark_noise(pairs, dark, long_dark)
+    require_series_below_well(pairs, long_lit, lit, saturation)
+    require_one_colour(pairs, long_lit.mean - long_dark.mean)
     top = float(signal[min(saturation, signal.size - 1)])
     # levels of whose variance nothing is cut off
     clear = lit.clear & (np.arange(signal.size) < saturation) & (signal > 0)
@@ -188,7 +188,7 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     noise = straight(dark.exposure_s[distinct], dark.variance[distinct], dark.error[distinct])
     # beyond the standard: the curve bends, and light may be more than stated
     curve = mean_curve(light[clear], signal[clear], np.full(int(clear.sum()), np.hypot(shared_error, black.rms)))
-    _check_light(pairs, curve, light, signal, clear)
+    require_steady_light(pairs, curve, light, signal, clear)
     # the variance as a polynomial, with errors that include the scatter of whole levels
     bins = _bins(pairs, lit, dark, signal, clear, distinct)
     fit = _variance_fit(bins)
@@ -207,58 +207,11 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     )  # fmt: skip
 
 
-def _check_dark(pairs: PairSet, dark: Levels, long_dark: Long) -> None:
-    for k, entry in enumerate(pairs.dark):
-        if dark.low[k] > 0.01:
-            raise entry.error(
-                f"{100 * dark.low[k]:.3g} % of the dark pixels are 0 DN, which hides a part of the noise; raise the "
-                "black level (offset)"
-            )
-    if long_dark.temporal.pixel <= 0:
-        raise pairs.spatial_dark.error("the frames do not differ")
-
-
-def _check_long(pairs: PairSet, long_lit: Long, lit: Levels, saturation: int) -> None:
-    """Refuse a long series at the full well, where the light makes no noise any more and no spread over pixels."""
-    if saturation >= lit.mean.size:
-        return
-    if long_lit.mean.mean() >= lit.mean[saturation] and long_lit.temporal.pixel < _WELL_PART * lit.variance[saturation]:
-        raise pairs.spatial_lit.error(
-            f"the long series is saturated, at {long_lit.mean.mean():.0f} DN; EMVA 1288 takes it at 50 % of saturation"
-        )
-
-
-def _check_mosaic(pairs: PairSet, signal: NDArray) -> None:
-    """Refuse frames whose places of a 2x2 tile have signals of their own, far apart beside the pixels' spread."""
-    rows, cols = (count - count % 2 for count in signal.shape)
-    # the four places of a tile, [place, pixel]
-    places = signal[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2).transpose(1, 3, 0, 2).reshape(4, -1)
-    middle = np.median(places, axis=1)
-    spread = np.median(np.abs(places - middle[:, None])) / 0.6745
-    if np.ptp(middle) > max(_MOSAIC * middle.mean(), 3 * spread):
-        shares = ", ".join(f"{100 * value / middle.max():.0f}" for value in middle)
-        raise pairs.spatial_lit.error(
-            f"the places of a 2x2 tile have {shares} % of the largest signal: a colour mosaic. EMVA 1288 evaluates one "
-            "colour at a time; state tile_rows: 2, tile_cols: 2 and tile_position: [row, column] in capture.yaml"
-        )
-
-
 def _saturation(lit: Levels) -> int:
     """Number of the level whose variance is largest; the number of levels where it rises to the end."""
     whole = lit.variance + np.maximum(lit.row, 0.0)
     k = int(np.argmax(whole))
     return whole.size if k == whole.size - 1 and lit.high[k] <= CLIPPED_SHARE else k
-
-
-def _check_light(pairs: PairSet, curve: MeanCurve, light: NDArray, signal: NDArray, clear: NDArray[np.bool_]) -> None:
-    expected = curve.at(light)
-    deviation = np.where(clear, np.abs(signal / expected - 1), 0.0)
-    deviation[signal < 0.02 * signal.max()] = 0.0  # offsets and dark drift weigh more than light there
-    k = int(np.argmax(deviation))
-    if deviation[k] > _MOST_SCATTER:
-        raise pairs.lit[k].error(
-            f"the light drifts between exposures: this pair is {100 * deviation[k]:.2g} % off the curve of all others"
-        )
 
 
 def _shared(dark: Levels, long_dark: Long) -> tuple[tuple[float, float], tuple[float, float]]:
