@@ -15,7 +15,8 @@ import numpy as np
 from ruamel.yaml import YAML
 
 import hesim_render as hr
-from hesim_render.specs.design import read_design
+from hesim_render.specs.design import DesignSpec
+from hesim_render.specs.files import read_spec
 from hesim_render.studies import reflectance_set
 from hesim_render.studies.design import Problem, optimise
 
@@ -146,7 +147,7 @@ def main(parts):
                 for each in folder.glob("large*"):
                     each.unlink()
         if "design" in parts:
-            problem = Problem(read_design("rggb-dyes"))
+            problem = Problem(read_spec(DesignSpec, "rggb-dyes", "studies"))
             timed("design rggb-dyes, 4 starts of 125 steps", lambda: optimise(problem))
 
 

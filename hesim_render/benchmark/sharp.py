@@ -116,36 +116,40 @@ def write_sharp(
 
 
 @dataclass(frozen=True)
-class SharpImages:
-    """Sharp images of a clip on disk; each is read when it is asked for.
+class StoredFlux:
+    """Fluxes of several times on disk; each is read when it is asked for.
 
     Parameters
     ----------
-    path : the file that `write_sharp` wrote.
+    path : the file that `write_sharp` or `write_colours` wrote.
     """
 
     path: Path
 
     def _read(self, name: str, number: int | None = None) -> NDArray:
-        return read_dataset(self.path, "as sharp images", name, number)
+        return read_dataset(self.path, "as images of a clip", name, number, kinds="fuiSO")
 
     @property
     def time_us(self) -> NDArray[np.float64]:
         """Middles of row 0's windows, [time], µs."""
         return self._read("time_us")
 
+    def flux_e_per_s(self, number: int) -> NDArray[np.float32]:
+        """Flux of one time, [row, col], e⁻/s, NaN where there is no frame value; of colours [row, col, channel]."""
+        return self._read("flux_e_per_s", number)
+
+    def stderr_e_per_s(self, number: int) -> NDArray[np.float32]:
+        """Standard error of the flux of one time, in the same shape, e⁻/s."""
+        return self._read("stderr_e_per_s", number)
+
+
+class SharpImages(StoredFlux):
+    """Sharp images of a clip on disk."""
+
     @property
     def row_offset_us(self) -> NDArray[np.float64]:
         """Delay of each row, [row], µs."""
         return self._read("row_offset_us")
-
-    def flux_e_per_s(self, number: int) -> NDArray[np.float32]:
-        """Flux of one time, [row, col], e⁻/s; NaN where there is no frame value."""
-        return self._read("flux_e_per_s", number)
-
-    def stderr_e_per_s(self, number: int) -> NDArray[np.float32]:
-        """Standard error of the flux of one time, [row, col], e⁻/s."""
-        return self._read("stderr_e_per_s", number)
 
     def raw_dn(self, number: int) -> NDArray[np.uint16]:
         """Noise-free RAW of one time, [row, col], DN."""
@@ -214,34 +218,10 @@ def write_colours(
     return len(times)
 
 
-@dataclass(frozen=True)
-class ColourTruth:
-    """Full-colour truth of a clip on disk; each image is read when it is asked for.
-
-    Parameters
-    ----------
-    path : the file that `write_colours` wrote.
-    """
-
-    path: Path
-
-    def _read(self, name: str, number: int | None = None) -> NDArray:
-        return read_dataset(self.path, "as full-colour images", name, number, kinds="fuiSO")
-
-    @property
-    def time_us(self) -> NDArray[np.float64]:
-        """Middles of row 0's windows, [time], µs."""
-        return self._read("time_us")
+class ColourTruth(StoredFlux):
+    """Full-colour truth of a clip on disk."""
 
     @property
     def channels(self) -> list[str]:
         """Names of the filters."""
         return [name.decode() if isinstance(name, bytes) else str(name) for name in self._read("channel")]
-
-    def flux_e_per_s(self, number: int) -> NDArray[np.float32]:
-        """Flux of one time through every filter, [row, col, channel], e⁻/s."""
-        return self._read("flux_e_per_s", number)
-
-    def stderr_e_per_s(self, number: int) -> NDArray[np.float32]:
-        """Its standard error, [row, col, channel], e⁻/s."""
-        return self._read("stderr_e_per_s", number)

@@ -113,6 +113,7 @@ class OpenFrames:
     def _add(self, frame: OpenFrame, begin_us: float, end_us: float) -> None:
         import drjit as dr
 
+        # the part of each row's exposure that lies in the piece, [row]; with a rolling shutter some rows have none
         starts = frame.exposure.row_begin_us(np.arange(self._sensor.rows))
         first = np.maximum(starts, begin_us)
         last = np.minimum(starts + frame.exposure.exposure_us, end_us)

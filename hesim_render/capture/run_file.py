@@ -22,6 +22,7 @@ from hesim_render.core.journal import journal_of
 from hesim_render.core.output import check_target, output_errors, replacing
 from hesim_render.core.progress import Progress, expect
 from hesim_render.core.region import parse_roi
+from hesim_render.core.yaml_file import read_yaml
 from hesim_render.isp import DENOISED_PICTURE, Pipeline, develop_recording, load_pipeline
 from hesim_render.mosaic.colour_profile import load_camera
 from hesim_render.recording.exports import check_format, check_name
@@ -32,9 +33,9 @@ from hesim_render.sensor.sensor import Sensor, load_sensor
 from hesim_render.sources.cube import CubeOptions
 from hesim_render.sources.scene import Scene, load_scene
 from hesim_render.sources.video import VideoOptions
-from hesim_render.specs.files import content_hash, load_yaml
+from hesim_render.specs.files import content_hash, read_spec
 from hesim_render.specs.problems import spec_error
-from hesim_render.specs.run import PICTURES, RECORDING, STATE, FileInput, RunSpec, read_run
+from hesim_render.specs.run import PICTURES, RECORDING, STATE, FileInput, RunSpec
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ def run(
 
 def _read(file: Path, out: Path, overrides: dict[str, object], allow_outside: bool) -> _Run:
     """The content of the file, and all files that it names, checked."""
-    spec = read_run(file, overrides)
+    spec = read_spec(RunSpec, file, overrides=overrides)
     sets: dict[bool, dict[str, object]] = {True: {}, False: {}}
     for key, value in spec.set.items():
         sets[key.startswith("sensor.")][key.removeprefix("sensor.")] = value
@@ -197,7 +198,7 @@ def _options(file: Path, key: str, given: FileInput, model: type[BaseModel]) -> 
     try:
         model.model_validate(options)
     except ValidationError as error:
-        data = load_yaml(file).get(key, {}).get("options", {})
+        data = read_yaml(file).get(key, {}).get("options", {})
         raise spec_error(error, model, data, file) from None
     return options
 

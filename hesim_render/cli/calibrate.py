@@ -111,7 +111,7 @@ def aps(
     console = Console(json_, quiet)
     if sensor_file is None:
         with console.progress("calibrate aps") as move:
-            calibrate_aps(captures, out, report, lambda what, part: move(part, 1.0, what), overwrite=overwrite)
+            calibrate_aps(captures, out, report, move.part, overwrite=overwrite)
     else:
         if not is_pair_set(captures):
             raise RangeError("--sensor-file", str(sensor_file), "none: captures of EMVA 1288 alone tell a whole sensor")
@@ -120,7 +120,7 @@ def aps(
         from hesim_render.calibrate.aps.sensor_file import write_sensor
 
         with console.progress("calibrate aps") as move:
-            pairs = calibrate_pairs(captures, out, report, lambda what, part: move(part, 1.0, what), overwrite)
+            pairs = calibrate_pairs(captures, out, report, move.part, overwrite)
             write_sensor(sensor_file, out, pairs)
     _show(console, "aps", out, report, sensor_file)
 
@@ -143,7 +143,7 @@ def evs(
 
     console = Console(json_, quiet)
     with console.progress("calibrate evs") as move:
-        calibrate_evs(captures, out, report, lambda what, part: move(part, 1.0, what), overwrite=overwrite)
+        calibrate_evs(captures, out, report, move.part, overwrite=overwrite)
     _show(console, "evs", out, report)
 
 
@@ -206,7 +206,7 @@ def recording(
     with console.progress("calibrate recording") as move:
         result = calibrate_recordings(
             files, out, lux=levels, target_file=target, target_contrast=contrast, target_hz=target_hz, shape=shape,
-            overwrite=overwrite, progress=lambda what, part: move(part, 1.0, what),
+            overwrite=overwrite, progress=move.part,
         )  # fmt: skip
     lines = []
     for one in result["recordings"]:
@@ -252,9 +252,7 @@ def twin(
 
     console = Console(json_, quiet)
     with console.progress("twin") as move:
-        result = make_twin(
-            captures, out, seed=seed, overwrite=overwrite, progress=lambda what, fraction: move(fraction, 1.0, what)
-        )
+        result = make_twin(captures, out, seed=seed, overwrite=overwrite, progress=move.part)
     lines = [check_line(check) for check in result.checks]
     passed = sum(check.passed for check in result.checks)
     looks = [f"look at: {finding.check}: {finding.text}" for finding in result.findings]

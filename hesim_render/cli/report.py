@@ -41,7 +41,7 @@ def report(
     with console.progress("report") as move:
         result = make_report(
             captures, out, size=shape, seed=seed, overwrite=overwrite,
-            progress=lambda what, part: move(part, 1.0, what),
+            progress=move.part,
         )  # fmt: skip
     lines = []
     tables = [] if result.events is None else event_tables(result.events)[:1]

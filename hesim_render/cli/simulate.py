@@ -229,10 +229,10 @@ def _run(
     """Do what the file of a run asks for, with other values of its keys and of those of the sensor file."""
     with console.stop_at_estimate(), console.progress(file.name) as progress:
         from hesim_render.capture.run_file import run
-        from hesim_render.specs.files import load_yaml
+        from hesim_render.core.yaml_file import read_yaml
 
         if sensor_keys:
-            of_file = changes.get("set", load_yaml(file).get("set")) or {}
+            of_file = changes.get("set", read_yaml(file).get("set")) or {}
             changes["set"] = {**of_file, **{f"sensor.{key}": value for key, value in sensor_keys.items()}}
         made = run(
             file, out, overrides=changes, allow_outside=allow_outside, progress=progress,

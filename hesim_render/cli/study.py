@@ -82,9 +82,10 @@ def study(
 
 def _compare(console: Console, spec: str, out: Path, keys: dict[str, Any], overwrite: bool) -> None:
     """Figures of filter sets."""
-    from hesim_render.specs.study import read_study
+    from hesim_render.specs.files import read_spec
+    from hesim_render.specs.study import StudySpec
 
-    chosen = read_study(spec, keys)
+    chosen = read_spec(StudySpec, spec, "studies", keys)
     from hesim_render.studies.run import MARKER
     from hesim_render.studies.table import NOTE, level_text
 
@@ -129,11 +130,12 @@ def _text(value: object) -> str:
 
 
 def _design(console: Console, spec: str, out: Path, keys: dict[str, Any], overwrite: bool) -> None:
-    from hesim_render.specs.design import read_design
+    from hesim_render.specs.design import DesignSpec
+    from hesim_render.specs.files import read_spec
     from hesim_render.studies.design_run import MARKER, design
     from hesim_render.studies.verdict import design_verdict
 
-    chosen = read_design(spec, keys)
+    chosen = read_spec(DesignSpec, spec, "studies", keys)
     check_target(out, MARKER, overwrite)
     with console.progress(chosen.name) as progress:
         result = design(chosen, out=out, overwrite=overwrite, progress=progress)
@@ -152,10 +154,11 @@ def _design(console: Console, spec: str, out: Path, keys: dict[str, Any], overwr
 def _sweep(console: Console, spec: str, out: Path, keys: dict[str, Any]) -> None:
     """Every combination of varied keys; runs that are there are not repeated."""
     from hesim_render.recording.quality import is_short_of_wish, verdict_lines
-    from hesim_render.specs.sweep import read_sweep
+    from hesim_render.specs.files import read_spec
+    from hesim_render.specs.sweep import SweepSpec
     from hesim_render.studies.sweep import VERDICT, check_sweep, sweep
 
-    chosen = read_sweep(spec, keys)
+    chosen = read_spec(SweepSpec, spec, "studies", keys)
     if console.dry_run:
         total, missing = check_sweep(chosen, out)
         text = f"{total} runs, {missing} of them not yet made; nothing was written (--dry-run)"

@@ -54,12 +54,12 @@ def reading(file: str | Path, what: str = "") -> Iterator[None]:
         raise SpecError(" ".join(filter(None, ("cannot be read", what, f"({reason(error)})"))), file=file) from None
 
 
-def require_plain(file: str | Path, key: str | None = None) -> None:
+def require_plain(file: str | Path) -> None:
     """Refuse a pipe, a socket or a device; what is missing is left to the reader.
 
     Parameters
     ----------
-    file, key : the file, and the key that names it, for the error.
+    file : what is going to be opened.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def require_plain(file: str | Path, key: str | None = None) -> None:
     except (OSError, ValueError):
         return
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-        raise SpecError("is a pipe or a device, and no file", file=file, key=key)
+        raise SpecError("is a pipe or a device, and no file", file=file)
 
 
 def reason(error: BaseException) -> str:

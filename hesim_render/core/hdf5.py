@@ -158,6 +158,13 @@ def dataset_of(file: Any, name: str, path: Path, kinds: str = "ui", also: Collec
     return data
 
 
+def is_whole(data: Any) -> bool:
+    """True if all values of a one-dimensional data set are stored; HDF5 reads the others as fill values."""
+    if data.chunks is None:
+        return data.id.get_storage_size() >= data.shape[0] * data.dtype.itemsize
+    return data.id.get_num_chunks() >= -(-data.shape[0] // data.chunks[0])
+
+
 def read_dataset(path: Path, what: str, name: str, number: int | None = None, kinds: str = "fui") -> Any:
     """The values of a data set (`dataset_of`), or of one entry of it.
 

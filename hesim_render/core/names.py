@@ -59,13 +59,13 @@ FileName = Annotated[str, AfterValidator(file_name)]
 PathBelow = Annotated[str, AfterValidator(path_below)]
 
 
-def require_file_name(text: str, file: str | Path, key: str | None = None) -> str:
+def require_file_name(text: str, file: str | Path) -> str:
     """`file_name`, for a name that is not part of a model.
 
     Parameters
     ----------
     text : the name.
-    file, key : where it stands, for the error.
+    file : where it stands, for the error.
 
     Raises
     ------
@@ -75,4 +75,4 @@ def require_file_name(text: str, file: str | Path, key: str | None = None) -> st
     try:
         return file_name(text)
     except ValueError as error:
-        raise SpecError(str(error), file=file, key=key) from None
+        raise SpecError(str(error), file=file) from None

@@ -147,6 +147,10 @@ class ProgressReport:
         with self._lock:
             self.pace.move(done, total, what)
 
+    def part(self, what: str, fraction: float) -> None:
+        """Progress of work that states what it does and the fraction done, as calibrations do."""
+        self(fraction, 1.0, what)
+
     def expect(self, seconds: float | None) -> None:
         """Set the estimated time of the run from now on, s; None where there is none."""
         with self._lock:

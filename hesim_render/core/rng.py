@@ -69,7 +69,7 @@ def stream_key(seed: int, stream: Stream) -> int:
     return z ^ (z >> 31)
 
 
-def philox(seed: int, stream: Stream, pixel: Any, index: int = 0, draw: int = 0) -> Any:
+def philox(seed: int, stream: Stream, pixel: Any, index: int = 0) -> Any:
     """Generator for one block of pixels at one frame or tick.
 
     Key and counters enter as opaque values, so a new seed or tick does not recompile a kernel.
@@ -79,14 +79,13 @@ def philox(seed: int, stream: Stream, pixel: Any, index: int = 0, draw: int = 0)
     seed, stream : seed of the run, and purpose of the numbers; together they make the key.
     pixel : Dr.Jit UInt32, index of each pixel on the full sensor.
     index : frame or tick number (64 bits are used).
-    draw : separates several blocks of four numbers for the same pixel and index.
     """
     import drjit as dr
 
     types = jit()
     key = dr.opaque(types.UInt64, stream_key(seed, stream))
     low = dr.opaque(types.UInt32, int(index) & 0xFFFFFFFF)
-    high = dr.opaque(types.UInt32, ((int(index) >> 32) ^ (int(draw) << 16)) & 0xFFFFFFFF)
+    high = dr.opaque(types.UInt32, (int(index) >> 32) & 0xFFFFFFFF)
     return types.Philox4x32(key, pixel, low, high)
 
 

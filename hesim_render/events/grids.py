@@ -157,6 +157,7 @@ def event_frames(
     begin, end = interval(events, begin_us, end_us)
     if not period_us > 0:
         raise RangeError("period_us", period_us, "a length above 0")
+    # a last picture of a billionth of a period would come from rounding
     number = int(np.ceil((end - begin) / period_us - 1e-9))
     pixels, planes = shape[0] * shape[1], 2 if kind == "counts" else 1
     if number * planes * pixels > _MOST_VALUES:
@@ -173,6 +174,7 @@ def event_frames(
         frames[picture * pixels + place] = np.where(on, 1, -1)  # of repeated places the last one stays
         return frames.reshape(number, *shape)
     total = number * pixels
+    # one count over picture and pixel together, for each polarity
     count_on, count_off = (
         np.bincount((picture * pixels + place)[which], minlength=total).astype(np.int32) for which in (on, ~on)
     )
@@ -225,6 +227,7 @@ def time_surface(
     place = checked(events, shape)
     _require_order(events)
     now = float(t_us) if t_us is not None else float(events["t_us"][-1]) if events.size else 0.0
+    # in order of time the last event of a pixel is the one that stays; none is infinitely old
     last = np.full((2, shape[0] * shape[1]), -np.inf)
     last[(events["polarity"] <= 0).astype(np.intp), place] = events["t_us"]
     age = (now - last) / tau_us
@@ -285,6 +288,7 @@ def voxel_grid(
     some = events[(times >= first) & (times <= last)]
     place = checked(some, shape)
     scaled = (some["t_us"] - first) * ((bins - 1) / (last - first) if last > first else 0.0)
+    # the bin before the event, and how far the event is on the way to the next; the last event falls into the last bin
     low = np.minimum(scaled.astype(np.intp), max(bins - 2, 0))
     part = scaled - low
     on = some["polarity"] > 0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading, require_memory
-from hesim_render.core.hdf5 import LARGEST_CHUNK_BYTES, dataset_of
+from hesim_render.core.hdf5 import LARGEST_CHUNK_BYTES, dataset_of, is_whole
 from hesim_render.exchange.dsec_writer import COLUMNS, LONGEST_US, EventFileWriter, write, write_plain
 from hesim_render.exchange.stream import BLOCK
 from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
@@ -165,14 +165,10 @@ def _column(file: Any, name: str, path: Path, kind: Any = np.uint64, signed: boo
         raise SpecError(f"{name} holds {column.dtype.name}; expected {np.dtype(kind).name}", file=path)
     if column.ndim != 1:
         raise SpecError(f"{name} has shape {column.shape}; expected one dimension", file=path)
-    size, item = column.shape[0], column.dtype.itemsize
-    if column.chunks is None:
-        stored = column.id.get_storage_size() >= size * item
-    else:
-        require_memory(column.chunks[0] * item, f"a chunk of {name}", path, LARGEST_CHUNK_BYTES)
-        stored = column.id.get_num_chunks() >= -(-size // column.chunks[0])
-    if not stored:
-        raise SpecError(f"{name} holds fewer values than the {size} it says", file=path)
+    if column.chunks is not None:
+        require_memory(column.chunks[0] * column.dtype.itemsize, f"a chunk of {name}", path, LARGEST_CHUNK_BYTES)
+    if not is_whole(column):
+        raise SpecError(f"{name} holds fewer values than the {column.shape[0]} it says", file=path)
     return column
 
 

@@ -41,9 +41,7 @@ def packets(stream: EventStream, target: str | Path) -> Iterator[tuple[int, byte
     SpecError
         If the sensor has more than 2048 rows or columns, or an event lies after 2⁴⁴ µs.
     """
-    rows, cols = stream.shape
-    if max(stream.shape) > _LARGEST_SIDE:
-        raise SpecError(f"EVT3 addresses at most {_LARGEST_SIDE} rows and columns, not {cols}x{rows} px", file=target)
+    stream.require_side(_LARGEST_SIDE, "EVT3", target)
     before, sent = None, 0
     for entries, is_trigger in merged(stream, stream.triggers(), stream.source, evt3.CHANNELS):
         if entries["t_us"][-1] > evt3.LATEST_US:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading, require_memory
-from hesim_render.core.hdf5 import LARGEST_CHUNK_BYTES, dataset_of, new_file, require_sound_heaps
+from hesim_render.core.hdf5 import LARGEST_CHUNK_BYTES, dataset_of, is_whole, new_file, require_sound_heaps
 from hesim_render.exchange import ecf
 from hesim_render.exchange.stream import EventStream
 from hesim_render.exchange.triggers import MOST_TRIGGERS, TRIGGER_DTYPE, no_triggers
@@ -40,9 +40,7 @@ def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
         If the sensor has more than 2048 rows or columns.
     """
     rows, cols = stream.shape
-    if max(stream.shape) > ecf.LARGEST_SIDE:
-        problem = f"ECF addresses at most {ecf.LARGEST_SIDE} rows and columns, not {cols}x{rows} px"
-        raise SpecError(problem, file=target)
+    stream.require_side(ecf.LARGEST_SIDE, "ECF", target)
     text = h5py.string_dtype("ascii")
     with new_file(Path(file.name)) as made:
         for key, value in {
@@ -235,14 +233,8 @@ def _records(file: Any, name: str, fields: Any, path: Path) -> Any:
         )
     require_memory((stored.chunks or stored.shape)[0] * stored.dtype.itemsize, f"a chunk of {name}", path,
                    LARGEST_CHUNK_BYTES if stored.chunks else None)  # fmt: skip
-    count = stored.shape[0]
-    stored_whole = (
-        stored.id.get_num_chunks() >= -(-count // stored.chunks[0])
-        if stored.chunks
-        else stored.id.get_storage_size() >= count * stored.dtype.itemsize
-    )
-    if not stored_whole:
-        raise SpecError(f"{name} holds fewer records than the {count} it says", file=path)
+    if not is_whole(stored):
+        raise SpecError(f"{name} holds fewer records than the {stored.shape[0]} it says", file=path)
     return stored
 
 

@@ -14,6 +14,8 @@ from hesim_render.spectral.spectrum import Spectrum, constant
 
 #: The grey patches of a ColorChecker without white and black (part of the last row), in the order of `patch_means`.
 NEUTRAL = slice(19, 23)
+#: Side of the square in a patch over the distance of neighbouring patches.
+_SHARE = 0.5
 
 Corner = tuple[float, float]
 
@@ -53,15 +55,12 @@ def patch_centres(corners: Sequence[Corner], rows: int = 4, cols: int = 6) -> ND
     return mapped[:, :2] / mapped[:, 2:]
 
 
-def patch_means(
-    image: NDArray, corners: Sequence[Corner], rows: int = 4, cols: int = 6, share: float = 0.5
-) -> NDArray[np.float64]:
+def patch_means(image: NDArray, corners: Sequence[Corner], rows: int = 4, cols: int = 6) -> NDArray[np.float64]:
     """Mean of each patch over a centred square, [patch, channel].
 
     Parameters
     ----------
     image : [row, col, channel]; NaN counts as missing.
-    share : side of the square over the distance of neighbouring patches.
 
     Raises
     ------
@@ -73,7 +72,7 @@ def patch_means(
     pitch = min(
         float(np.hypot(*np.moveaxis(np.diff(grid, axis=axis), -1, 0)).min()) for axis in (0, 1) if grid.shape[axis] > 1
     )
-    half = max(0.5, share * pitch / 2)
+    half = max(0.5, _SHARE * pitch / 2)
     means = []
     for row, col in centres:
         top, bottom, left, right = (round(value) for value in (row - half, row + half, col - half, col + half))
@@ -88,8 +87,8 @@ def patch_means(
     return np.array(means)
 
 
-def reference_linear_srgb(light: Spectrum | None = None, dataset: str = "ISO 17321-1") -> NDArray[np.float64]:
+def reference_linear_srgb(light: Spectrum | None = None) -> NDArray[np.float64]:
     """Linear sRGB of a ColorChecker's 24 patches under a light (default D65), its white adapted to (1, 1, 1)."""
     light = light or spectra.illuminant("D65")
-    patches = list(spectra.colorchecker_reflectances(dataset).values())
+    patches = list(spectra.colorchecker_reflectances("ISO 17321-1").values())
     return xyz_to_linear_srgb(tristimulus(light, patches), tristimulus(light, [constant(1.0)])[0])

@@ -53,6 +53,7 @@ class SampleBlocks:
 
     def basis(self) -> NDArray[np.float32]:
         """Principal axes of a patch of pictures, [sample of 2×2 blocks, axis], the largest first."""
+        # a patch is 2×2 blocks; axes are those in which pictures, in units of their noise, vary most
         corners = [(i, j) for i in range(2) for j in range(2)]
         at = np.concatenate([self.at + np.array(corner) * self.size for corner in corners])
         channel, amplitude = np.tile(self.channel, 4), np.tile(self.amplitude, 4)
@@ -82,12 +83,15 @@ def one_pass(
     lock = threading.Lock()  # neighbouring bands share a row of blocks: a sum of two terms, whose order does not matter
 
     def work(rows: slice) -> None:
+        # patches of the band, and all around them with which they are compared
         halo = slice(max(rows.start - _REACH, 0), min(rows.stop + _REACH, patch_rows))
         noisy = _coefficients(values, basis, halo)
         clean = None if pilot is None else _coefficients(pilot, basis, halo)
         inside = slice(rows.start - halo.start, rows.stop - halo.start)
+        # the most similar patches of each, by what is known of the picture so far, [patch, member]
         alike = _alike(_features(noisy if clean is None else clean, clean is None), inside)
         estimate, weights = _estimate(noisy, clean, alike, inside.start * patch_cols)
+        # back to samples; each sample has estimates from the four patches that contain it, by their weights
         patches = (estimate @ basis.T).reshape(rows.stop - rows.start, patch_cols, 4, -1)
         patches *= weights.reshape(patches.shape[:2])[..., None, None]
         part = np.zeros((len(patches) + 1, *values.shape[1:]), dtype=np.float32)
@@ -130,9 +134,11 @@ def _alike(features: NDArray[np.float32], inside: slice) -> NDArray[np.int64]:
         left, right = max(0, -dx), min(width, width - dx)
         if top >= bottom or left >= right:
             continue
+        # squared distance of all patches of the band to those at one offset
         difference = features[top:bottom, left:right] - features[top + dy : bottom + dy, left + dx : right + dx]
         into = distance[top - inside.start : bottom - inside.start, left:right, k]
         np.einsum("rcf,rcf->rc", difference, difference, out=into)
+    # small frames have fewer neighbours
     members = min(_ALIKE, min(_REACH + 1, height) * min(_REACH + 1, width))
     flat = distance.reshape(count * width, -1)
     nearest = np.argpartition(flat, members - 1, axis=1)[:, :members]
@@ -154,10 +160,13 @@ def _estimate(
         own = noisy[first + part.start : first + part.stop]
         mean, square = _moments(noisy, alike[part])
         if clean is None:
+            # first pass: noise has a variance of 1, so what the members scatter beyond it is picture
             spread = (square - mean * mean) * np.float32(members / max(members - 1, 1))
             of_mean = (np.abs(mean) > _THRESHOLD / members**0.5).astype(np.float32)
             of_rest = np.maximum(spread - 1, 0) / np.maximum(spread, np.float32(1e-6))
         else:
+            # second pass: the Wiener filter, whose signal is that of the first result; a patch that lies away from its
+            # kind keeps more of its own
             picture, square = _moments(clean, alike[part])
             spread = np.maximum(square - picture * picture, 0)
             away = clean[first + part.start : first + part.stop] - picture
@@ -165,7 +174,9 @@ def _estimate(
             of_mean = picture * picture
             of_mean /= of_mean + 1 / members
             of_rest = signal / (signal + 1)
+        # the mean of the members has a noise of 1/members, and what is the own patch beside it the whole noise
         out[part] = of_mean * mean + of_rest * (own - mean)
+        # variance of the noise that the estimate still has: its inverse is the weight
         left = np.einsum("pc,pc->p", of_rest, of_rest) + np.einsum("pc,pc->p", of_mean, of_mean) / members
         weights[part] = 1 / (np.float32(_LEAST_LEFT) + left)
     return out, weights

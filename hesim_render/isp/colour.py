@@ -92,6 +92,7 @@ def fit_srgb_matrix(patches: ArrayLike, reference: ArrayLike) -> ColourFit:
         matrix, scale = unpack(values)
         return float(delta_e_2000(scale * camera @ matrix.T, target).mean())
 
+    # ΔE2000 has kinks, so that a search without derivatives improves the least squares
     best = start
     if camera.shape[1] > 1:
         result = minimize(loss, start, method="Powell", options={"maxiter": 20, "xtol": 1e-4, "ftol": 1e-5})
@@ -102,6 +103,7 @@ def fit_srgb_matrix(patches: ArrayLike, reference: ArrayLike) -> ColourFit:
 
 def _constrained_least_squares(camera: NDArray, target: NDArray) -> NDArray[np.float64]:
     """Columns but the first of the matrix [3, channel] whose rows sum to 1, by least squares."""
+    # with the first column as 1 less the others, white stays white whatever the rest is
     result, *_ = np.linalg.lstsq(camera[:, 1:] - camera[:, :1], target - camera[:, :1], rcond=None)
     return result.T
 

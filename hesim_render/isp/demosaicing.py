@@ -52,11 +52,13 @@ def demosaic(raw: NDArray[np.float32], tile: ArrayLike, method: str = "guided") 
     channels = int(block.max()) + 1
     if channels == 1 and (block >= 0).all():
         return np.asarray(raw, dtype=np.float32)[..., None]
+    # in square roots shot noise is alike at all levels
     encoded = np.asarray(raw, dtype=np.float32) if method == "linear" else _encoded(raw)
     planes = split(encoded, block.shape)
     if method == "linear" or channels == 1:
         estimates = [_linear(planes, block, channel) for channel in range(channels)]
     else:
+        # the channel with most samples guides the others: it is known at most places
         most = int(np.argmax(np.bincount(block[block >= 0])))
         green = predict_guide(planes, block, most)
         estimates = [
@@ -129,6 +131,7 @@ def _linear(planes: NDArray[np.float32], block: NDArray, channel: int) -> NDArra
     out = np.empty((*block.shape, planes.shape[1] - 2, planes.shape[2] - 2), dtype=np.float32)
     for row, col in known:
         out[row, col] = planes[row * block.shape[1] + col, 1:-1, 1:-1]
+    # each missing place of a block is a fixed sum of the values around, one stencil for all blocks
     weights = kriging.stencil(_as_key(block), channel, tuple(wanted))
     rows_of, cols_of = np.array(wanted).T
 
@@ -145,6 +148,7 @@ def _guided(
     """A channel as a local linear function of the guide, plus the interpolated residual of its own samples."""
     known, wanted = _targets(block, channel)
     bh, bw = block.shape
+    # a channel follows the guide within a few blocks: slope and offset of every block, spread evenly between blocks
     samples = [planes[row * bw + col, 1:-1, 1:-1] for row, col in known]
     slope, offset = (bordered(plane[None]) for plane in _regression([guide[place] for place in known], samples))
     spread = kriging.bilinear_stencil((bh, bw), tuple(float(k) for k in np.mean(known, axis=0)))
@@ -159,6 +163,7 @@ def _guided(
             np.subtract(samples[k][rows], out[(*position, rows)], out=residual[k, rows])
 
     in_bands(guide.shape[2], predict, BAND_BLOCKS)
+    # what the line leaves at the own samples is interpolated, so that these are met exactly
     around = bordered(residual)
     weights = kriging.lone_stencil((bh, bw), tuple(known), tuple(wanted))
 
@@ -184,5 +189,6 @@ def _regression(guide: Sequence[NDArray[np.float32]], own: Sequence[NDArray[np.f
     covariance = around(g * o for g, o in zip(guide, own, strict=True)) - mean_guide * mean_own
     variance = around(g * g for g in guide) - mean_guide * mean_guide
     ridge = np.float32(_RIDGE)
+    # the ridge draws the slope to 1 where the guide is flat: there it tells nothing
     slope = (covariance + ridge) / (np.maximum(variance, 0) + ridge)
     return slope, mean_own - slope * mean_guide

@@ -46,6 +46,7 @@ def denoise(
     """
     channels = np.asarray(tile)
     stabilisers = _stabilisers(noise, channels, top_dn)
+    # noise of standard deviation 1 everywhere, whatever the level
     stable = _each(signal_dn, channels.shape, stabilisers, Stabiliser.forward)
     clean = _reduced(stable, channels, 1 / np.sqrt(np.asarray(balance, dtype=np.float64)))
     out = _each(clean, channels.shape, stabilisers, Stabiliser.backward)
@@ -82,6 +83,7 @@ def _each(
 
 def _reduced(stable: NDArray[np.float32], tile: NDArray, amplitude: NDArray) -> NDArray[np.float32]:
     """The mosaic with its noise, of standard deviation 1, reduced."""
+    # the first result tells the second pass which patches are alike, and how much of each is signal
     pilot = _over_phases(stable, None, tile, amplitude)
     fine = _over_phases(stable, pilot, tile, amplitude)
     return fine + _long_waves(stable, fine, tile, amplitude)
@@ -136,11 +138,14 @@ def _long_waves(
         planes = split(image, block.shape)[:, 1:-1, 1:-1]
         return np.stack([planes[own].mean(axis=0) for own in channels])
 
+    # patches reach a few blocks, and leave noise of longer waves; the means of blocks show these.
+    # A mean of k samples has the noise 1/√k: in units of that it is 1 again.
     clean = _reduced_means(means(stable) * roots[:, None, None], block.shape, amplitude * roots)
     clean /= roots[:, None, None]
     out = np.zeros_like(fine)
     spread = kriging.bilinear_stencil(block.shape, tuple((size - 1) / 2 for size in block.shape))
     for channel, rest in enumerate(clean - means(fine)):
+        # only long waves are corrected: shorter ones are better in the result than in the means
         smooth = bordered(gaussian_filter(rest, _LONG_BLOCKS, mode="nearest")[None])
         planes = kriging.apply(smooth, spread, slice(0, rest.shape[0])).reshape(*block.shape, *rest.shape)
         planes *= (block == channel)[:, :, None, None]

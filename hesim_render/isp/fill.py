@@ -35,6 +35,7 @@ def fill_positions(raw: NDArray[np.float32], tile: ArrayLike, filled: ArrayLike)
     before, after = np.asarray(tile), np.asarray(filled)
     out = raw.copy()
     period = before.shape
+    # the frame with a margin, in which the tile goes on, so that offsets reach beyond the edges
     margin = 2 * max(period)
     rows, cols = (_kept_in_phase(size, p, margin) for size, p in zip(raw.shape, period, strict=True))
     padded = raw[rows][:, cols]
@@ -72,6 +73,7 @@ def fill_pixels(raw: NDArray[np.float32], tile: ArrayLike, bad: NDArray[np.bool_
     out = raw.copy()
     unknown = bad & (channels[np.ix_(*(np.arange(n) % p for n, p in zip(raw.shape, channels.shape, strict=True)))] >= 0)
     while unknown.any():
+        # from the rim inwards: what was filled in one round is a neighbour in the next
         still = unknown.copy()
         for row, col in np.ndindex(*channels.shape):
             if channels[row, col] >= 0:
@@ -137,11 +139,14 @@ def _mean_of_bridges(
         a, b = neighbour(one), neighbour(other)
         reach_a, reach_b = float(np.hypot(*one)), float(np.hypot(*other))
         span = np.float32(reach_a + reach_b)
+        # on a line between both ends, at the place of the missing sample
         share = np.float32(reach_b) / span
         rise = np.abs(a - b)
         value = b + share * (a - b)
+        # along an edge both ends are alike, across it they differ: the even direction counts most
         weight = 1 / ((rise + np.float32(_EVEN)) ** 2 * span)
         if np.isnan(value).any():
+            # a single end is better than nothing, and far worse than two
             lone = np.where(np.isnan(a), b, a)
             value = np.where(np.isnan(value), lone, value)
             weight = np.where(np.isnan(weight), np.float32(1), weight)

@@ -94,6 +94,7 @@ class FrameNoise:
         }
         gain = aps.system_gain_dn_per_e
         if not maps:
+            # unknown maps: their spread over pixels looks like noise in a single frame
             common["residual_dn2"] += 0.0 if "dsnu" in off else (gain * aps.dsnu_e) ** 2
             return cls(
                 **common,
@@ -262,6 +263,7 @@ class FrameNoise:
 
         def work(rows: slice) -> None:
             offset, dark, response = (part[rows] for part in maps)
+            # in the order in which the sensor adds them: offset, dark signal, then the response to light
             np.subtract(signal_dn[rows], offset, out=out[rows])
             out[rows] -= dark * t
             out[rows] /= np.maximum(response, np.float32(0.1))  # a dead pixel stays dark

@@ -61,6 +61,7 @@ def predict_guide(planes: NDArray[np.float32], block: NDArray, channel: int) -> 
     """
     known = [tuple(place) for place in np.argwhere(block == channel)]
     wanted = [tuple(place) for place in np.argwhere(block != channel)]
+    # one matrix for all priors: predictions of the wanted places, and residuals of the known samples
     weights, member, counts = _stencils(tuple(map(tuple, block.tolist())), channel, tuple(wanted))
     height, width = planes.shape[1] - 2, planes.shape[2] - 2
     out = np.empty((*block.shape, height, width), dtype=np.float32)
@@ -77,6 +78,8 @@ def predict_guide(planes: NDArray[np.float32], block: NDArray, channel: int) -> 
             around = slice(rows.start, rows.stop + 2), slice(cols.start, cols.stop + 2)
             result = kriging.apply(wide, weights, *around)
             result = result.reshape(len(PRIORS), -1, *result.shape[1:])
+            # the prior that predicts the samples around best has most of the share; unusual priors must be better by a
+            # factor
             energy = _energy(result[:, len(wanted) :], member, counts)
             energy *= _handicap(colour[rows, cols])
             share = _shares(energy)

@@ -85,6 +85,8 @@ class _Equations:
         self._names = np.unique(self._channel)
         self._moves = [axis for axis in range(2) if np.ptp(at[:, axis]) > 0]
         self._centre, self._scale = at.mean(axis=0), scale
+        # weights of least variance under the condition that planes of each colour are met exactly (Lagrange
+        # multipliers)
         drift = self._planes(at, self._channel)
         n, p = drift.shape
         system = np.zeros((n + p, n + p))
@@ -125,6 +127,7 @@ def _window(block: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     rows, cols = block.shape
     y, x = np.mgrid[-rows : 2 * rows, -cols : 2 * cols]
     channel = np.tile(block, (3, 3))
+    # samples of the block and its eight neighbours that lie near enough
     near = (y >= -REACH_PX) & (y < rows + REACH_PX) & (x >= -REACH_PX) & (x < cols + REACH_PX) & (channel >= 0)
     y, x, channel = y[near], x[near], channel[near]
     index = ((y % rows * cols + x % cols) * 3 + y // rows + 1) * 3 + x // cols + 1
@@ -249,6 +252,7 @@ def apply(
     pieces = -(-size // _PIECE)
     line = np.zeros(pieces * _PIECE, dtype=np.float32)
     image, cut = line[:size].reshape(height, width), line.reshape(pieces, _PIECE)
+    # pixels in short pieces, [piece, reading, pixel], each of which one product on the calling thread serves
     around = np.empty((pieces, count, _PIECE), dtype=np.float32)
     for k, (position, dy, dx) in enumerate(taps.reads):
         image[:] = planes[position, rows.start + dy : rows.stop + dy, cols.start + dx : cols.stop + dx]

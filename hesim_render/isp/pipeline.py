@@ -16,7 +16,7 @@ from hesim_render.isp.steps import BEFORE_DENOISE, ON_MOSAIC, Demosaic, Denoise,
 from hesim_render.mosaic.colour_profile import Camera
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.recording.frame import Frame
-from hesim_render.specs.files import Strict, load_yaml, validate
+from hesim_render.specs.files import Strict, read_spec
 
 
 class Pipeline(Strict):
@@ -114,8 +114,7 @@ def load_pipeline(file: str | Path) -> Pipeline:
     SpecError
         If the file is not valid; the message names file, line and key.
     """
-    path = Path(file)
-    return validate(Pipeline, load_yaml(path), path, {})
+    return read_spec(Pipeline, Path(file))
 
 
 def process(

@@ -83,23 +83,28 @@ def _compared(
     values = signal_dn[:, col :: tile.shape[1]]
     if rows.size == 0 or values.shape[1] < 2:
         return []
+    # a sample against those of its channel above and below, on a line between them
     share = down / (up + down)
     expected = share * values[rows - up] + (1 - share) * values[rows + down]
     difference = (values[rows] - expected).astype(np.float64)
     a, b, c = noise.variance(place)
     level = np.maximum(expected, 0)
+    # noise of the difference of the three
     sigma = np.sqrt((a + level * (b + level * c)) * (1 + share**2 + (1 - share) ** 2))
+    # mean over the row that edges do not move: weights of a Cauchy law, in rounds from the median
     centre = np.median(difference, axis=1)
     weight = np.ones_like(difference)
     for _ in range(_ROUNDS):
         weight = 1 / (sigma**2 * (1 + ((difference - centre[:, None]) / (_EDGE * sigma)) ** 2))
         centre = (weight * difference).sum(axis=1) / weight.sum(axis=1)
+    # what the differences scatter beyond noise is picture, whose neighbours are alike: it averages out more slowly
     scatter = (weight * (difference - centre[:, None]) ** 2).sum(axis=1) / weight.sum(axis=1)
     even = (weight * sigma**2).sum(axis=1) / weight.sum(axis=1)
     count = weight.sum(axis=1) ** 2 / (weight**2).sum(axis=1)
     picture = np.maximum(scatter - even, 0) * max(_ALIKE_PX / tile.shape[1], 1)
     variance = (even + picture) / count
     spread = row_std_dn**2 * (1 + share**2 + (1 - share) ** 2)
+    # a row this far off shows picture: it says nothing of the offset
     variance[centre**2 > _FAR**2 * (spread + variance)] = np.inf
     return [_Comparison(rows, up, down, centre, variance)]
 
@@ -107,6 +112,7 @@ def _compared(
 def _likeliest(result: list[_Comparison], height: int, row_std_dn: float) -> NDArray[np.float64]:
     """Offsets that minimise Σ (difference - predicted difference)² / variance + Σ offset² / prior variance."""
     reach = max((item.up + item.down for item in result), default=0)
+    # the normal equations couple rows at most `reach` apart: a band matrix, with the prior on its diagonal
     band = np.zeros((reach + 1, height))  # lower form of solveh_banded
     band[0] = 1 / row_std_dn**2
     right = np.zeros(height)

@@ -82,15 +82,18 @@ class Stabiliser:
     @cached_property
     def _inverse(self) -> tuple[float, float, NDArray[np.float32]]:
         """Signals at even steps of the mean of f, and its first and last value."""
+        # signals from far below 0, where noise leads, up to the end of the table
         below = -_FAR * float(self._scale(0.0)) * np.linspace(1, 0, 256, endpoint=False)
         signal = np.concatenate([below, self._signal])
         mean = self._mean(signal, self.sigma(signal))
+        # few counts have a Poisson law, whose mean of f is a sum over counts
         few = (signal > 0) & (signal < _MANY * self._b)
         if few.any():
             counts = np.arange(_MOST)
             chance = poisson.pmf(counts, signal[few, None] / self._b)
             rest = np.sqrt(np.maximum(self.sigma(signal[few]) ** 2 - self._b * signal[few], 0))
             mean[few] = sum(p * self._mean(np.full_like(rest, self._b * k), rest) for k, p in enumerate(chance.T))
+        # the mean of f rises with the signal: looked up the other way round
         steps = np.linspace(mean[0], mean[-1], _ENTRIES)
         return mean[0], mean[-1], np.interp(steps, mean, signal).astype(np.float32)
 

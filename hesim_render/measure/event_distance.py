@@ -29,7 +29,7 @@ INTERVALS_US = 10 ** np.linspace(0.0, 8.0, 161)
 WINDOW_US, LAGS = 1000, (1, 2, 4, 8, 16, 32)
 #: Windows in which pixels count as active, µs, and the neighbours whose activity is compared: rows and columns away.
 ACTIVE_US, NEIGHBOURS = 5000, ((0, 1), (1, 0), (0, 2), (2, 0))
-#: Longest gap within a burst, µs, and longest burst that is told apart.
+#: Longest gap within a burst, µs, and longest burst that is distinguished.
 GAP_US, LONGEST = 1000, 64
 _LEAST_EVENTS, _LEAST_PART_US = 100 * PARTS, 2 * WINDOW_US
 
@@ -79,6 +79,7 @@ def event_statistics(stream: EventStream) -> EventStatistics:
         raise SpecError(problem, file=stream.source)
     rows, cols = stream.shape
     result: list[tuple[NDArray, ...]] = []
+    # blocks of the file are cut at the ends of parts: only what belongs to the next part is held
     held, last_us = [no_events()], np.full(rows * cols, -1, np.int64)
     for events in (*stream, no_events()):
         held.append(events)
@@ -107,18 +108,23 @@ def _part(
     pixel = y * cols + x
     on = np.count_nonzero(events["polarity"] > 0)
     count = np.bincount(pixel, minlength=rows * cols).astype(np.uint32)
+    # events in successive windows; the rest of the part after the last whole one is left out
     series = np.bincount(t_us // WINDOW_US, minlength=part_us // WINDOW_US)[: part_us // WINDOW_US]
+    # by pixel, then by time: the interval before each event, for the first one of a pixel from the part before
     order = np.argsort(pixel, kind="stable")
     own, times = pixel[order], t_us[order] + begin_us
     first = np.diff(own, prepend=-1) != 0
     before_us = np.where(first, last_us[own], np.append(0, times[:-1])[: own.size])
     gap = (times - before_us)[before_us >= 0]
     intervals = np.histogram(np.maximum(gap, 1), INTERVALS_US)[0]
+    # the last event of each pixel, for the next part
     ends = np.append(first[1:], True)[: own.size]
     last_us[own[ends]] = times[ends]
+    # bursts: successive events of a pixel without a long gap, counted by their lengths
     starts = np.flatnonzero(first | (times - before_us > GAP_US))
     length = np.diff(np.append(starts, own.size))
     bursts = np.bincount(np.minimum(length, LONGEST), minlength=LONGEST + 1)
+    # pixels active in a window, each once; with each neighbour, the windows in which both are
     key = np.unique((t_us // ACTIVE_US) * (rows * cols) + pixel)
     row, col = np.divmod(key % (rows * cols), cols)
     active = [int(key.size)]
@@ -129,7 +135,7 @@ def _part(
 
 
 #: Draws of the bootstrap, and hot pixels: so many times the usual rate.
-_DRAWS, _HOT = 200, 10.0
+_DRAWS, _SEED, _HOT = 200, 1, 10.0
 _Draw = NDArray[np.intp]
 
 
@@ -167,13 +173,12 @@ class EventDistance:
         }  # fmt: skip
 
 
-def event_distances(first: EventStatistics, second: EventStatistics, seed: int = 1) -> list[EventDistance]:
+def event_distances(first: EventStatistics, second: EventStatistics) -> list[EventDistance]:
     """All distances of two streams.
 
     Parameters
     ----------
     first, second : statistics of the streams, from `event_statistics`.
-    seed : of the bootstrap.
 
     Raises
     ------
@@ -185,7 +190,8 @@ def event_distances(first: EventStatistics, second: EventStatistics, seed: int =
         raise SpecError(
             f"is of {cols}x{rows} px; expected {own_cols}x{own_rows}, as {first.source}", file=second.source
         )
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
+    # the parts of a stream, drawn with replacement: twice of the first, once of the second
     draws = rng.integers(0, PARTS, (3, _DRAWS, PARTS))
     whole = np.arange(PARTS)
     result = []
@@ -237,6 +243,7 @@ def _over_time(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
     series = one.series[draw].astype(np.float64)
     series = series - series.mean()
     variance = np.mean(series**2)
+    # within a part only; lags longer than one have no correlation
     lags = [lag for lag in LAGS if lag < series.shape[1]]
     result = [np.mean(series[:, lag:] * series[:, :-lag]) / max(variance, 1e-300) for lag in lags]
     return np.array(result + [0.0] * (len(LAGS) - len(lags)))
@@ -246,6 +253,7 @@ def _over_space(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
     active = one.active[draw].sum(axis=0).astype(np.float64)
     rows, cols = one.shape
     windows = one.windows * len(draw)
+    # correlation of the activity of two pixels: joint share less the product of both, over the variance of one
     share = active[0] / (windows * rows * cols)
     pairs = np.array([(rows - down) * (cols - right) for down, right in NEIGHBOURS], np.float64)
     both = active[1:] / (windows * np.maximum(pairs, 1.0))
@@ -254,6 +262,7 @@ def _over_space(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
 
 def _hot(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
     count = one.pixels[draw].sum(axis=0)
+    # the mean of nine tenths of the pixels, which hot ones do not raise
     usual = np.sort(count)[: max(1, round(0.9 * count.size))].mean() + 1 / count.size
     return np.array([np.mean(count > np.maximum(_HOT * usual, 3.0))])
 

@@ -33,7 +33,7 @@ def psnr(picture: NDArray, truth: NDArray, peak: float = 1.0, valid: NDArray[np.
     return float("inf") if mse == 0 else 10 * float(np.log10(peak**2 / mse))
 
 
-def ssim(picture: NDArray, truth: NDArray, peak: float = 1.0) -> float:
+def ssim(picture: NDArray, truth: NDArray) -> float:
     """Structural similarity [wang2004]: Gaussian window of σ 1.5 px (11×11), K₁ 0.01, K₂ 0.03, mean over channels.
 
     The border of 5 px, where the window leaves the picture, does not count. This is skimage's `structural_similarity`
@@ -41,8 +41,7 @@ def ssim(picture: NDArray, truth: NDArray, peak: float = 1.0) -> float:
 
     Parameters
     ----------
-    picture, truth : [row, col] or [row, col, channel], at least 11 px on each side; clipped at the peak.
-    peak : largest value.
+    picture, truth : [row, col] or [row, col, channel], at least 11 px on each side; clipped at 1.
 
     Returns
     -------
@@ -50,7 +49,7 @@ def ssim(picture: NDArray, truth: NDArray, peak: float = 1.0) -> float:
     """
     from scipy.ndimage import gaussian_filter
 
-    a, b = below_peak(picture, truth, peak)
+    a, b = below_peak(picture, truth, 1.0)
     if min(a.shape[:2]) < 11:
         raise RangeError("shape of the picture", a.shape, "11 px or more on each side, the window of SSIM")
     if a.ndim == 2:
@@ -62,7 +61,7 @@ def ssim(picture: NDArray, truth: NDArray, peak: float = 1.0) -> float:
     mean_a, mean_b = smooth(a), smooth(b)
     var_a, var_b = smooth(a * a) - mean_a**2, smooth(b * b) - mean_b**2
     both = smooth(a * b) - mean_a * mean_b
-    c1, c2 = (_K1 * peak) ** 2, (_K2 * peak) ** 2
+    c1, c2 = _K1**2, _K2**2
     index = (2 * mean_a * mean_b + c1) * (2 * both + c2) / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
     return float(index[5:-5, 5:-5].mean(dtype=np.float64))
 

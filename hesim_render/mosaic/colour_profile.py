@@ -14,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 
 from hesim_render.core.errors import RangeError
 from hesim_render.mosaic.description import Mosaic
-from hesim_render.specs.files import Strict, load_yaml, validate
+from hesim_render.specs.files import Strict, read_spec
 from hesim_render.spectral import transfer as curves
 from hesim_render.spectral.transfer import Transfer
 
@@ -205,5 +205,4 @@ def load_camera(file: str | Path) -> Camera:
     SpecError
         If the file is not valid; the message names file, line and key.
     """
-    path = Path(file)
-    return validate(Camera, load_yaml(path), path, {})
+    return read_spec(Camera, Path(file))

@@ -48,6 +48,7 @@ class PoissonPoints:
         -------
         place, t_us, mark : [point], index into `pixel`, time in µs, and a number in (0, 1) that belongs to the point.
         """
+        # all cells [cell] that the interval meets; the points of a cell depend on its number alone
         first, last = (np.floor(t / self._cell_us).astype(np.int64) for t in (begin_us, end_us))
         count = last - first + 1
         which = np.repeat(np.arange(count.size), count)
@@ -64,6 +65,7 @@ class PoissonPoints:
         """Number in (0, 1) that belongs to the last point of the processes `which` [m] at or before `t_us` [m], µs."""
         cell = np.floor(t_us / self._cell_us[which]).astype(np.int64)
         until = np.asarray(t_us, np.float64)
+        # from the cell of the time back to the first one with a point before it
         number, open_ = np.full(which.size, -1, np.int64), np.arange(which.size)
         while open_.size:
             begin_us = cell[open_] * self._cell_us[which[open_]]
@@ -91,6 +93,7 @@ class PoissonPoints:
         """
         here, elapsed, block = np.arange(which.size), np.zeros(which.size), 0
         while here.size:
+            # exponential gaps from one point to the next, a block of random words at a time, until the cell ends
             draw = np.full(here.size, block, np.uint32)
             result = random_words(self._seed, self._stream, self._pixel[which[here]], _counter(cell[here]), draw)
             for k in range(_BLOCK):

@@ -19,7 +19,7 @@ from hesim_render.core.npz import member_header, read_arrays, stream_member
 from hesim_render.core.units import S_PER_US
 from hesim_render.sensor.reading import read_sensor
 from hesim_render.specs.capture import CaptureSpec
-from hesim_render.specs.files import load_yaml, validate
+from hesim_render.specs.files import read_spec
 from hesim_render.specs.sensor import SensorSpec
 
 #: Largest clean signal of an event pixel: a thousand times the largest DN of 16 bits, for bright lights.
@@ -103,7 +103,7 @@ def read_captures(folder: str | Path) -> CaptureSet:
     file = path / "capture.yaml"
     if not file.is_file():
         raise SpecError("no such file; it states bit_depth, tile_rows and tile_cols", file=file)
-    spec = validate(CaptureSpec, load_yaml(file), file, {})
+    spec = read_spec(CaptureSpec, file)
     sensor = None
     if spec.sensor is not None:
         is_name = Path(spec.sensor).name == spec.sensor.removesuffix(".yaml") and not (path / spec.sensor).exists()

@@ -66,11 +66,7 @@ def import_recording(
         If a file is damaged, does not fit the sensor, or has other triggers than a pulse for each frame.
     """
     aps, layout = sensor.spec.aps, sensor.layout
-    if events is not None and Path(events).suffix.lower() == ".mcap":
-        has_events, has_frames = mcap_file.holds(Path(events).expanduser())
-        if has_frames and aps is not None and not frames:
-            frames = [events]
-        events = events if has_events and sensor.spec.evs is not None else None
+    events, frames = _of_mcap(events, frames, sensor)
     if events is None and not frames:
         raise RangeError("frames", list(frames), "events, frames or both")
     if frames and aps is None:
@@ -78,13 +74,12 @@ def import_recording(
     stream = None if events is None else _events(events, sensor)
     if trigger_channel is not None and (stream is None or not frames):
         raise RangeError("trigger_channel", trigger_channel, "nothing, unless both events and frames are given")
+    # begin and length of each exposure, µs; the recording ends with the last row, or with the events
     spans = [] if stream is None else [_span_us(stream)]
     times: list[tuple[int, int]] = []
     if aps is not None and frames:
         if stream is not None and trigger_channel is not None:
-            images = _images_of(frames)
-            count = len(frames) if images is None else sum(1 for _ in mcap_file.read_frames(images))
-            times = _triggered(stream, trigger_channel, count)
+            times = _triggered(stream, trigger_channel, frames)
         else:
             starts = _starts_us(frames, aps.frame_rate_hz, aps.exposure_us)
             times = [(start, aps.exposure_us) for start in starts]
@@ -116,6 +111,18 @@ def import_recording(
         return writer.finish()
 
 
+def _of_mcap(
+    events: str | Path | None, frames: Sequence[str | Path], sensor: Sensor
+) -> tuple[str | Path | None, Sequence[str | Path]]:
+    """Events and frames of what is given: an MCAP file of events may hold the frames as well, or alone."""
+    if events is None or Path(events).suffix.lower() != ".mcap":
+        return events, frames
+    has_events, has_frames = mcap_file.holds(Path(events).expanduser())
+    if has_frames and sensor.spec.aps is not None and not frames:
+        frames = [events]
+    return (events if has_events and sensor.spec.evs is not None else None), frames
+
+
 def _name(file: str | Path | None) -> str | None:
     return None if file is None else Path(file).name
 
@@ -139,8 +146,10 @@ def _span_us(stream: EventStream) -> tuple[int, int]:
     return (max(0, begin_us - 1) // 1000 * 1000 if stream.interval_us is None else begin_us), end_us
 
 
-def _triggered(stream: EventStream, channel: int, count: int) -> list[tuple[int, int]]:
-    """Begin and length of each exposure, µs, by the triggers of a line."""
+def _triggered(stream: EventStream, channel: int, frames: Sequence[str | Path]) -> list[tuple[int, int]]:
+    """Begin and length of each exposure, µs, by the triggers of a line: a pulse for each frame."""
+    images = _images_of(frames)
+    count = len(frames) if images is None else sum(1 for _ in mcap_file.read_frames(images))
     begin, end = exposures_of_pulses(stream.triggers(), channel, count, stream.source)
     if np.any(end <= begin):
         raise SpecError(f"has pulses of triggers on line {channel} without length", file=stream.source)

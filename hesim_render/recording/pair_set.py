@@ -24,7 +24,7 @@ from hesim_render.recording.emva_list import find_list, numbers, read_list
 from hesim_render.recording.grey_picture import PICTURE_SUFFIXES, grey_size, read_grey
 from hesim_render.recording.series import Series
 from hesim_render.specs.capture import CaptureSpec
-from hesim_render.specs.files import load_yaml, validate
+from hesim_render.specs.files import read_spec
 
 #: Names of a plain folder: light, exposure in µs, photons per pixel if known, number of the frame.
 _NAME = re.compile(r"(dark|lit)_([0-9.]+)us(?:_([0-9.]+)ph)?_([0-9]+)(\.[A-Za-z]+)")
@@ -188,7 +188,7 @@ def _capture_spec(folder: Path, bit_depth: int | None, listed: str = "") -> Capt
     """``capture.yaml``; a list of the standard states the bits itself and needs none."""
     file = folder / "capture.yaml"
     if file.is_file():
-        spec = validate(CaptureSpec, load_yaml(file), file, {})
+        spec = read_spec(CaptureSpec, file)
         if bit_depth not in (None, spec.bit_depth):
             raise SpecError(f"states {spec.bit_depth} bit, {listed} {bit_depth}", file=file, key="bit_depth")
         return spec
@@ -203,7 +203,7 @@ def _capture_spec(folder: Path, bit_depth: int | None, listed: str = "") -> Capt
 def _listed(file: Path) -> tuple[CaptureSpec, tuple[int, int], list[Series]]:
     """What a list of the standard's form lists."""
     own = file.parent / "capture.yaml"
-    unit = validate(CaptureSpec, load_yaml(own), own, {}).exposure_unit if own.is_file() else None
+    unit = read_spec(CaptureSpec, own).exposure_unit if own.is_file() else None
     bit_depth, shape, series = read_list(file, unit)
     return _capture_spec(file.parent, bit_depth, file.name), shape, series
 

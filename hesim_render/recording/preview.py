@@ -100,11 +100,11 @@ def busiest_window(picture: Picture, fraction: float) -> tuple[float, float]:
     return corners[int(np.argmax(spread))]
 
 
-def panel_sheet(panels: Sequence[Panel], title: str, width_px: int, columns: int = 2) -> Image.Image:
+def panel_sheet(panels: Sequence[Panel], title: str, width_px: int) -> Image.Image:
     """Panels of one width side by side with captions, under a title."""
     gap, line = 14, 24
     pictures = [fitted(panel.picture, width_px) for panel in panels]
-    columns = min(columns, len(pictures))
+    columns = min(2, len(pictures))
     rows = [list(range(k, min(k + columns, len(pictures)))) for k in range(0, len(pictures), columns)]
     heights = [max(pictures[k].shape[0] for k in row) + line for row in rows]
     size = (gap + columns * (width_px + gap), 2 * gap + line + sum(heights) + gap * (len(rows) - 1))
@@ -122,9 +122,7 @@ def panel_sheet(panels: Sequence[Panel], title: str, width_px: int, columns: int
     return sheet
 
 
-def save_animation(path: str, pictures: Sequence[Picture], frame_ms: int = 80) -> None:
+def save_animation(path: str, pictures: Sequence[Picture]) -> None:
     """An endless animated GIF."""
     images = [Image.fromarray(picture).quantize(96) for picture in pictures]
-    images[0].save(
-        path, format="GIF", save_all=True, append_images=images[1:], duration=frame_ms, loop=0, optimize=False
-    )
+    images[0].save(path, format="GIF", save_all=True, append_images=images[1:], duration=80, loop=0, optimize=False)

@@ -41,15 +41,7 @@ if TYPE_CHECKING:
 class Recorded:
     """Frames, events and manifest of one run: the content of a `Recording`, which adds what can be made of it.
 
-    Parameters
-    ----------
-    frames : a list, or the `StoredFrames` of a folder.
-    manifest : what `recording.json` holds, see `hesim_render.recording.manifest`.
-    events : structured array [event] of `EVENT_DTYPE`; None reads the events of `path` on first use.
-    event_truth : noise-free flux of the event pixels; None reads the truth of `path` on first use.
-    path : the folder, None for a recording in memory.
-    labels : what caused each event; None reads the labels of `path` on first use, where there are any.
-    scene : the scene that was rendered, where it is known; None makes it from the manifest when `truth` asks for it.
+    Its parameters are those of a `Recording`.
     """
 
     def __init__(

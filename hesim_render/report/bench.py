@@ -14,7 +14,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out, printable, require_memory
 from hesim_render.exchange import EventStream, open_events
 from hesim_render.specs.event_bench import BenchRecording, EventBenchSpec, LightSteps
-from hesim_render.specs.files import load_yaml, validate
+from hesim_render.specs.files import read_spec
 
 BENCH_NAME = "bench.yaml"
 #: Bytes for one step of one pixel, with all copies.
@@ -64,7 +64,7 @@ class EventBench:
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self.file = self.folder / BENCH_NAME
-        self.spec: EventBenchSpec = validate(EventBenchSpec, load_yaml(self.file), self.file, {})
+        self.spec: EventBenchSpec = read_spec(EventBenchSpec, self.file)
         self._tallies: dict[str, EventTally] = {}
 
     def path(self, name: str) -> Path:

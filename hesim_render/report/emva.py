@@ -12,7 +12,6 @@ from hesim_render.calibrate.aps.pairs import PairCalibration, evaluate
 from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.pairs_output import content
 from hesim_render.calibrate.estimate import estimated, not_identifiable
-from hesim_render.calibrate.moments import Progress
 from hesim_render.recording.pair_set import read_pair_set
 from hesim_render.report.estimates import figure
 
@@ -64,15 +63,14 @@ class FrameFigures:
         }  # fmt: skip
 
 
-def frame_figures(folder: str | Path, progress: Progress | None = None) -> FrameFigures:
+def frame_figures(folder: str | Path) -> FrameFigures:
     """Evaluate EMVA 1288 captures.
 
     Parameters
     ----------
     folder : of the captures.
-    progress : called with a text that names the current work and the fraction done.
     """
-    result = evaluate(read_pair_set(folder), progress)
+    result = evaluate(read_pair_set(folder))
     section = content(result)
     names = (
         "K", "responsivity", "quantum_efficiency", "temporal_dark_noise_e", "dark_current_e_per_s", "full_well_e",

@@ -26,7 +26,7 @@ _GRID, _SLOPE_GRID = np.linspace(-5.0, 5.0, 81), np.linspace(-3.6, 3.6, 13)
 #: Shares between which a point lies on the slope of the curve.
 _SLOPE = (0.03, 0.97)
 _FEWEST_PIXELS = 20
-#: A spread whose logarithm is less certain than this is not told apart from none.
+#: A spread whose logarithm is less certain than this is not distinguished from none.
 _UNSURE = 0.5
 #: Range of ln σ/τ, starts of the fit, bound of the search for a limit.
 _RATIO, _STARTS, _RATIO_MOST = (-6.0, 4.0), (-3.0, 0.0), 8.0

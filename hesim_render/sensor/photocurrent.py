@@ -63,6 +63,7 @@ def band_weights(
             f"bands from {bands[0]:g} to {bands[-1]:g} nm do not cover the response ({low:g}-{high:g} nm); "
             f"at least {REQUIRED_COVERAGE:.1%} of it is needed"
         )
+    # on the samples of both, so that each is linear within a step
     grid = merged_grid(response, Spectrum(bands, np.ones_like(bands)), step_nm=INTEGRATION_STEP_NM)
     step = np.diff(grid)
     trapezoid = np.zeros_like(grid)

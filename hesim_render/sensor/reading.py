@@ -17,9 +17,10 @@ from hesim_render.calibration.measured import MeasuredMaps, measured_maps, read_
 from hesim_render.calibration.sensor_values import apply_calibration, with_intervals
 from hesim_render.core.errors import HesimWarning, SpecError
 from hesim_render.core.units import S_PER_US
+from hesim_render.core.yaml_file import read_yaml
 from hesim_render.sensor.from_data_sheet import derive
 from hesim_render.specs.event_pixels import DERIVED, SHEETS, EvsSpec
-from hesim_render.specs.files import apply_overrides, load_yaml, locate, validate
+from hesim_render.specs.files import apply_overrides, locate, validate
 from hesim_render.specs.problems import line_of
 from hesim_render.specs.sensor import NoiseFile, NoisePart, SensorSpec, SheetSensorSpec
 from hesim_render.specs.sensor_checks import unused
@@ -68,7 +69,7 @@ def read_sensor_file(name_or_path: str | Path, overrides: Mapping[str, Any] | No
         that no pixel uses after `overrides` is a `HesimWarning`, as is a value that no sensor has (`doubts`).
     """
     file = locate(name_or_path, "sensors")
-    data, changes = load_yaml(file), dict(overrides or {})
+    data, changes = read_yaml(file), dict(overrides or {})
     if "pixels" not in data and {"target", "objects", "light", "camera", "mitsuba"} & set(data):
         raise SpecError("is a scene file; expected a sensor file", file=file)
     # parse: the calibration is taken out, because its values come before those of the overrides

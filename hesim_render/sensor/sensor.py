@@ -15,6 +15,7 @@ from hesim_render.calibration.measured import MeasuredMaps
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.html import table
 from hesim_render.core.plain import PlainState
+from hesim_render.core.yaml_file import read_yaml
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps.model import ApsNoise
 from hesim_render.pixels.evs.model import EvsNoise
@@ -22,7 +23,7 @@ from hesim_render.pixels.measured import measured_part, require_region
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.lens import Lens
 from hesim_render.sensor.reading import read_sensor_file
-from hesim_render.specs.files import load_yaml, locate
+from hesim_render.specs.files import locate
 from hesim_render.specs.lens import LensSpec
 from hesim_render.specs.problems import line_of
 from hesim_render.specs.sensor import SensorSpec
@@ -185,7 +186,7 @@ class Sensor(PlainState):
             return SpecError(message, key=key)
         try:
             file = locate(self.file, "sensors")
-            return SpecError(message, file=file, line=line_of(load_yaml(file), key.split(".")), key=key)
+            return SpecError(message, file=file, line=line_of(read_yaml(file), key.split(".")), key=key)
         except SpecError:
             return SpecError(message, file=self.file, key=key)
 

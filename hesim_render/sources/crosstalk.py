@@ -65,6 +65,8 @@ class CrosstalkFlux:
         if begin.ndim == end.ndim == 0:
             asked, place = np.unique(sites, return_inverse=True)
         else:
+            # each pixel in each of its intervals once, as two listed pixels may share a neighbour; an interval is a
+            # complex number, so that one sort serves both ends
             interval = np.broadcast_to(begin + 1j * end, own.shape)
             intervals, number = np.unique(interval, return_inverse=True)
             asked, place = np.unique(sites * intervals.size + number, return_inverse=True)

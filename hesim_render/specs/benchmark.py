@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, PositiveInt, field_validator, model_validator
 
 from hesim_render.core.errors import SpecError
-from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.files import Strict, read_spec
 
 #: Splits, in the order in which scenes are assigned to them.
 SPLITS = ("train", "val", "test")
@@ -269,6 +269,5 @@ def read_benchmark(file: str | Path, overrides: Mapping[str, Any] | None = None)
     path = Path(file)
     if not path.is_file():
         raise SpecError("no such file", file=file)
-    path = locate(path.resolve(), "scenes")
-    spec = validate(BenchmarkSpec, load_yaml(path), path, overrides or {})
-    return spec.model_copy(update={"folder": path.parent})
+    spec = read_spec(BenchmarkSpec, path.resolve(), overrides=overrides)
+    return spec.model_copy(update={"folder": path.resolve().parent})

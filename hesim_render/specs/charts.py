@@ -130,7 +130,7 @@ class GreyRampTarget(SizedTarget):
 
 
 class DeadLeavesTarget(SizedTarget):
-    """Discs of random place, radius and grey that hide each other, a scale-invariant texture [cao2010].
+    """Discs of random place, radius and grey that occlude each other, a scale-invariant texture [cao2010].
 
     Radii have a density proportional to r⁻³ between the two limits, greys are uniform between the two reflectances.
     The texture is drawn with `texels_across` texels, so that an edge is off by up to half a texel.

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.files import Strict
 from hesim_render.specs.study import NamedLight, NamesFiles, SetUseSpec, SurfacesSpec
 
 _Lux = Annotated[float, Field(gt=0, le=1e9)]
@@ -86,15 +84,3 @@ class DesignSpec(NamesFiles):
         if self.silicon_depth_um is not None and self.silicon_depth_um[0] >= self.silicon_depth_um[1]:
             raise ValueError("silicon_depth_um: expected the least and the largest depth")
         return self
-
-
-def read_design(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> DesignSpec:
-    """A design's file, by shipped name or path, perhaps with other values of dotted keys.
-
-    Raises
-    ------
-    SpecError
-        With file, line and key of all that is wrong.
-    """
-    file = locate(name_or_path, "studies")
-    return validate(DesignSpec, load_yaml(file), file, overrides or {})

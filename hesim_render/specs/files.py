@@ -101,11 +101,6 @@ def locate(name_or_path: str | Path, kind: str) -> Path:
     )
 
 
-def load_yaml(file: Path) -> CommentedMap:
-    """The mapping in a YAML file, with line numbers kept."""
-    return read_yaml(file)
-
-
 def apply_overrides(data: dict[str, Any], overrides: Mapping[str, Any]) -> None:
     """Set dotted keys (``aps.read_noise_e``; list items by number) in place, before validation."""
     for dotted, value in overrides.items():
@@ -158,6 +153,31 @@ def validate(model: type[Model], data: dict[str, Any], file: Path | None, overri
         return model.model_validate(_plain(data), context={"folder": file.parent if file else Path()})
     except ValidationError as error:
         raise spec_error(error, model, data, file, overrides) from None
+
+
+def read_spec(
+    model: type[Model], given: Any, kind: str | None = None, overrides: Mapping[str, Any] | None = None
+) -> Model:
+    """A model as it is, of its content, or of its file.
+
+    Parameters
+    ----------
+    model : what is read.
+    given : a model, its content as a dictionary, or a path; with `kind` also the name of a shipped file.
+    kind : folder of the shipped files, such as ``studies``; None where none are shipped.
+    overrides : dotted keys and their values, applied before validation; a model has had its own.
+
+    Raises
+    ------
+    SpecError
+        With file, line and key of all that is wrong.
+    """
+    if isinstance(given, model):
+        return given
+    if isinstance(given, Mapping):
+        return validate(model, dict(given), None, overrides or {})
+    file = Path(given) if kind is None else locate(given, kind)
+    return validate(model, read_yaml(file), file, overrides or {})
 
 
 def _require_plain_texts(node: Any, data: Any, file: Path | None, place: tuple[Any, ...] = ()) -> None:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from hesim_render.core.errors import did_you_mean
-from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.files import Strict, read_spec
 from hesim_render.specs.sensor import EvsGridSpec, PixelSpec, tile_text
 from hesim_render.specs.spectrum import SpectrumSpec
 
@@ -102,24 +102,10 @@ class FilterSetSpec(Strict):
 
 
 def read_filter_set(name_or_path: str | Path) -> FilterSetSpec:
-    """A filter set, by shipped name or path.
-
-    Raises
-    ------
-    SpecError
-        With file, line and key of all that is wrong.
-    """
-    file = locate(name_or_path, SETS)
-    return validate(FilterSetSpec, load_yaml(file), file, {})
+    """A filter set, by shipped name or path."""
+    return read_spec(FilterSetSpec, name_or_path, SETS)
 
 
 def read_palette(name_or_path: str | Path) -> PaletteSpec:
-    """A palette, by shipped name or path.
-
-    Raises
-    ------
-    SpecError
-        With file, line and key of all that is wrong.
-    """
-    file = locate(name_or_path, PALETTES)
-    return validate(PaletteSpec, load_yaml(file), file, {})
+    """A palette, by shipped name or path."""
+    return read_spec(PaletteSpec, name_or_path, PALETTES)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from hesim_render.specs.benchmark import NAME, SensorChoice
-from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.files import Strict, locate, read_spec
 
 Rate = Annotated[float, Field(ge=1, le=1e6)]
 
@@ -67,7 +67,6 @@ def read_peers(file: str | Path, overrides: Mapping[str, Any] | None = None) -> 
     SpecError
         If the file is not valid; the message names file, line and key.
     """
-    path = Path(file)
-    path = locate(path.resolve(), "scenes")
-    spec = validate(PeersSpec, load_yaml(path), path, overrides or {})
+    path = locate(Path(file).resolve(), "scenes")
+    spec = read_spec(PeersSpec, path, overrides=overrides)
     return spec.model_copy(update={"folder": path.parent})

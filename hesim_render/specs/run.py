@@ -14,8 +14,9 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 
 from hesim_render.core.names import FileName
 from hesim_render.core.region import parse_roi
+from hesim_render.core.yaml_file import read_yaml
 from hesim_render.specs.design import DesignSpec
-from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.files import Strict, locate
 from hesim_render.specs.scene import SceneSpec
 from hesim_render.specs.study import NamesFiles, StudySpec
 from hesim_render.specs.sweep import SweepSpec
@@ -116,18 +117,6 @@ class RunSpec(NamesFiles):
         return self
 
 
-def read_run(file: str | Path, overrides: dict[str, Any] | None = None) -> RunSpec:
-    """The file of a run.
-
-    Raises
-    ------
-    SpecError
-        With file, line and key of all that is wrong.
-    """
-    path = Path(file)
-    return validate(RunSpec, load_yaml(path), path, overrides or {})
-
-
 class StudyKind(StrEnum):
     """Kinds of studies."""
 
@@ -146,7 +135,7 @@ Kind = TypeVar("Kind")
 
 def _kind_of(file: Path, models: Mapping[Kind, type[BaseModel]]) -> Kind:
     """The kind whose model has most of the file's keys, so that a misspelt key does not change it."""
-    keys = set(load_yaml(file))
+    keys = set(read_yaml(file))
     return max(models, key=lambda kind: len(keys & set(models[kind].model_fields)))
 
 

@@ -20,7 +20,8 @@ from pydantic import (
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out, reading
-from hesim_render.specs.files import Strict, apply_overrides, load_yaml, locate, validate
+from hesim_render.core.yaml_file import read_yaml
+from hesim_render.specs.files import Strict, apply_overrides, locate, validate
 from hesim_render.specs.geometry import Direction, Size, Vector
 from hesim_render.specs.light import LampSpec, LightSpec
 from hesim_render.specs.mitsuba_scene import MitsubaSpec
@@ -251,7 +252,7 @@ def read_scene(
         If the file is not valid; the message names file, line and key.
     """
     file = locate(name_or_path, "scenes")
-    data, changes = load_yaml(file), overrides or {}
+    data, changes = read_yaml(file), overrides or {}
     if "pixels" in data and "tile" in data:
         raise SpecError("is a sensor file; expected a scene file", file=file)
     if not allow_outside:

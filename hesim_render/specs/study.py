@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.files import Strict
 from hesim_render.specs.reflectance import InFolder
 from hesim_render.specs.spectrum import SpectrumSpec
 
@@ -177,15 +176,3 @@ def surfaces_of(text: str) -> dict[str, str]:
         return {"scene" if text in list_names("scenes") and text != "colorchecker" else "reflectances": text}
     kind = {".yaml": "scene", ".yml": "scene", ".csv": "reflectances"}.get(path.suffix.lower(), "cube")
     return {kind: str(path.resolve())}
-
-
-def read_study(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> StudySpec:
-    """A study's file, by shipped name or path, perhaps with other values of dotted keys.
-
-    Raises
-    ------
-    SpecError
-        With file, line and key of all that is wrong.
-    """
-    file = locate(name_or_path, "studies")
-    return validate(StudySpec, load_yaml(file), file, overrides or {})

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from hesim_render.core.errors import did_you_mean
-from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.files import Strict
 from hesim_render.specs.study import NamesFiles
 
 #: Most runs of a sweep.
@@ -118,15 +116,3 @@ class SweepSpec(NamesFiles):
         if total > MOST_RUNS:
             raise ValueError(f"vary: makes {total} runs, more than {MOST_RUNS}")
         return self
-
-
-def read_sweep(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> SweepSpec:
-    """A sweep's file, by shipped name or path, perhaps with other values of dotted keys.
-
-    Raises
-    ------
-    SpecError
-        With file, line and key of all that is wrong.
-    """
-    file = locate(name_or_path, "studies")
-    return validate(SweepSpec, load_yaml(file), file, overrides or {})

@@ -86,6 +86,7 @@ def noisy_chart(
     """
     tile_rows, tile_cols = sensor.layout.tile_shape
     count = len(patch_e)
+    # a nearly square chart in whole tiles; what is left over repeats the last patch
     across = ceil(sqrt(count))
     down = ceil(count / across)
     high, wide = (-(-patch_px // size) * size for size in (tile_rows, tile_cols))
@@ -99,6 +100,7 @@ def noisy_chart(
     number = np.arange(down)[:, None] * across + np.arange(across)
     patch = np.minimum(np.kron(number, np.ones((high, wide), dtype=np.int64)), count - 1)
     image = mixed(patch_e[patch, part.layout.filter_index], crosstalk)
+    # temporal noise alone: fixed patterns would be the same in all repeats
     aps = part.aps.without(*_FIXED)
     spec = part.spec.aps
     assert spec is not None
@@ -107,6 +109,7 @@ def noisy_chart(
     for repeat in range(repeats):
         raw = aps.sample(image, exposure_us, seed, repeat).astype(np.float64)
         frames.append((raw - spec.black_level_dn) / spec.system_gain_dn_per_e - dark)
+    # a tile at the rim of a patch has light of its neighbours
     margin = 1 if crosstalk > 0 else 0
     shape = (repeats, down, high // tile_rows, tile_rows, across, wide // tile_cols, tile_cols)
     cells = np.stack(frames).reshape(shape)
@@ -166,6 +169,7 @@ def measured_figures(
     rgb = grey @ rgb_matrix.T
     amplification = np.sqrt(rgb.var(axis=1, ddof=1).mean(axis=-1) / grey.var(axis=1, ddof=1).mean(axis=-1))
     seen = lab(balanced[:, :-GREYS] @ xyz_matrix.T, samples.white_xyz)
+    # against the true colour of each patch, at every output pixel
     wanted = lab(samples.xyz, samples.white_xyz)[None, :, None]
     difference = delta_e_2000(seen, np.broadcast_to(wanted, seen.shape))
     return {

@@ -162,13 +162,13 @@ def reflectance_set(name: str) -> dict[str, Spectrum]:
     )
 
 
-def held(reflectance: Spectrum, low_nm: float = 360.0, high_nm: float = 830.0) -> Spectrum:
+def held(reflectance: Spectrum) -> Spectrum:
     """A reflectance whose first and last value hold up to the ends of the renderable wavelengths."""
     grid, values = reflectance.wavelength_nm, reflectance.values
-    if grid[0] > low_nm:
-        grid, values = np.append(low_nm, grid), np.append(values[0], values)
-    if grid[-1] < high_nm:
-        grid, values = np.append(grid, high_nm), np.append(values, values[-1])
+    if grid[0] > 360.0:
+        grid, values = np.append(360.0, grid), np.append(values[0], values)
+    if grid[-1] < 830.0:
+        grid, values = np.append(grid, 830.0), np.append(values, values[-1])
     return Spectrum(grid, values)
 
 

@@ -50,12 +50,15 @@ def difference_weights(xyz: NDArray[np.float64], white_xyz: NDArray[np.float64])
     xyz : [surface, 3].
     white_xyz : [3].
     """
+    # derivatives of CIELAB by XYZ, [surface, 3, 3]; the cube root becomes a line near black
     ratio = np.maximum(xyz / white_xyz, 1e-6)
     slope = np.where(ratio > (6 / 29) ** 3, ratio ** (-2 / 3) / 3, (29 / 6) ** 2 / 3) / white_xyz
     jacobian = np.zeros((len(xyz), 3, 3))
     jacobian[:, 0, 1] = 116 * slope[:, 1]
     jacobian[:, 1, 0], jacobian[:, 1, 1] = 500 * slope[:, 0], -500 * slope[:, 1]
     jacobian[:, 2, 1], jacobian[:, 2, 2] = 200 * slope[:, 1], -200 * slope[:, 2]
+    # along lightness, chroma and hue, each over its weight in CIE94 and CIEDE2000: steps of chroma and hue are seen
+    # less where the chroma is high
     lightness, a, b = lab(xyz, white_xyz).T
     chroma = np.hypot(a, b)
     unit = np.stack([a, b]) / np.maximum(chroma, 1e-9)
@@ -158,6 +161,7 @@ class DesignCost:
         chosen = [dr.gather(jit().Float64, per_lux[k], index) for k in self.frames]
         total: Float64 = jit().Float64(0.0)
         if self.weights.colour:
+            # any brightness does without noise; a fixed one keeps the term of `_LEAST_VARIANCE` small
             scale = 1e4 / max(float(np.mean(each.numpy())) for each in chosen)
             electrons = [each * dr.opaque(jit().Float64, scale) for each in chosen]
             total += self.weights.colour * self._difference(condition, electrons, None)
@@ -191,9 +195,11 @@ class DesignCost:
             noise = replace(noise, count=np.array([float(each[0]) for each in counts]))
         host = np.stack([np.array(each, dtype=np.float64) for each in electrons], axis=1)
         spread = np.full_like(host, _LEAST_VARIANCE) if counts is None else noise.variance_e2(host)
+        # the matrix has no derivative of its own: at its best the cost does not change with it
         matrix = best_matrix(host, spread, condition.xyz, condition.weights)
         rows = [table(types.Float64, condition.weights[:, i, j]) for i in range(3) for j in range(3)]
         true = [table(types.Float64, column) for column in condition.xyz.T]
+        # deviation of XYZ of each surface, with derivatives by the electrons
         off = [
             sum(
                 (dr.opaque(types.Float64, float(matrix[i, c])) * each for c, each in enumerate(electrons)),
@@ -204,6 +210,7 @@ class DesignCost:
         total: Float64 = 0.0
         for i in range(3):
             total += dr.square(rows[3 * i] * off[0] + rows[3 * i + 1] * off[1] + rows[3 * i + 2] * off[2])
+        # noise of channel c moves the colour by W M_c: its variance times the square of that length
         weighted = np.einsum("sij,jc->sic", condition.weights, matrix)
         for c, each in enumerate(electrons):
             gain = table(types.Float64, np.sum(weighted[:, :, c] ** 2, axis=1))
@@ -236,6 +243,7 @@ def best_matrix(
     [3, channel].
     """
     count = electrons.shape[1]
+    # channels of one size, so that the equations are well conditioned
     scale = electrons.mean(axis=0)
     c = electrons / scale
     metric = np.einsum("ski,skj->sij", weights, weights)

@@ -16,8 +16,8 @@ import numpy as np
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress, shown
 from hesim_render.core.yaml_file import write_yaml
-from hesim_render.specs.design import DesignSpec, read_design
-from hesim_render.specs.files import validate
+from hesim_render.specs.design import DesignSpec
+from hesim_render.specs.files import read_spec
 from hesim_render.specs.filter_set import FilterSetSpec, read_palette
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.specs.study import StudySpec
@@ -79,10 +79,7 @@ def design(
     OutputError
         If `out` exists or cannot be written. No partial output is left.
     """
-    if isinstance(spec, Mapping):
-        read: DesignSpec = validate(DesignSpec, dict(spec), None, {})
-    else:
-        read = spec if isinstance(spec, DesignSpec) else read_design(spec)
+    read = read_spec(DesignSpec, spec, "studies")
     with OutputFolder(out, MARKER, overwrite) as folder:
         with shown(progress, read.name) as report:
             problem = Problem(read)

@@ -101,20 +101,19 @@ def patch_plot(group: Sequence[Seen]) -> str:
     return svg(figure)
 
 
-def chart_picture(seen: Seen, across: int = 6, size_px: int = 26) -> NDArray[np.uint8]:
+def chart_picture(seen: Seen) -> NDArray[np.uint8]:
     """Patches in sRGB: the true colour in the upper left half of each, that after the matrix in the lower right half.
 
     Parameters
     ----------
     seen : with a matrix.
-    across : patches in a row.
-    size_px : side of a patch.
 
     Returns
     -------
     uint8 [row, col, 3].
     """
     assert seen.colour is not None
+    across, size_px = 6, 26
     samples = seen.samples
     count = min(len(samples.xyz), 4 * across)
     chosen = np.linspace(0, len(samples.xyz) - 1, count).round().astype(int)  # of many, evenly spaced ones

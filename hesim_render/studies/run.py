@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress, shown
-from hesim_render.specs.files import validate
-from hesim_render.specs.study import StudySpec, read_study
+from hesim_render.specs.files import read_spec
+from hesim_render.specs.study import StudySpec
 from hesim_render.studies.cfa import run_study
 from hesim_render.studies.report import report_page
 from hesim_render.studies.table import Table, has_parquet
@@ -59,10 +59,7 @@ def study(
     OutputError
         If `out` exists or cannot be written. No partial output is left.
     """
-    if isinstance(spec, Mapping):
-        read: StudySpec = validate(StudySpec, dict(spec), None, {})
-    else:
-        read = spec if isinstance(spec, StudySpec) else read_study(spec)
+    read = read_spec(StudySpec, spec, "studies")
     with nullcontext() if out is None else OutputFolder(out, MARKER, overwrite) as folder:
         with shown(progress, read.name) as report:
             result = run_study(read, report)

@@ -16,14 +16,15 @@ from hesim_render.core.guard import WholeFile
 from hesim_render.core.output import check_target, output_errors, replacing
 from hesim_render.core.progress import Progress, shown
 from hesim_render.core.region import parse_roi
+from hesim_render.core.yaml_file import read_yaml
 from hesim_render.isp.pipeline import DEFAULT, Pipeline, load_pipeline
 from hesim_render.recording.recording import Recording
 from hesim_render.sensor.sensor import load_sensor
 from hesim_render.sources.scene import load_scene
-from hesim_render.specs.files import content_hash, load_yaml, locate, validate
+from hesim_render.specs.files import content_hash, locate, read_spec, validate
 from hesim_render.specs.filter_set import read_filter_set, read_palette
 from hesim_render.specs.study import StudySpec
-from hesim_render.specs.sweep import RangeSpec, SweepSpec, read_sweep
+from hesim_render.specs.sweep import RangeSpec, SweepSpec
 from hesim_render.studies.run import study
 from hesim_render.studies.sweep_metrics import RunFigures, changed_pipeline
 from hesim_render.studies.table import Cell, Table
@@ -113,7 +114,7 @@ def sweep(
     OutputError
         If `out` holds other things, or cannot be written.
     """
-    read = _read(spec)
+    read = read_spec(SweepSpec, spec, "studies")
     folder = check_target(out, MARKER, overwrite=True)
     runs = list(runs_of(read))
     with output_errors(folder):
@@ -144,16 +145,10 @@ def check_sweep(spec: str | Path | Mapping[str, Any] | SweepSpec, out: str | Pat
     -------
     Number of runs, and of those among them that are still to be made.
     """
-    read = _read(spec)
+    read = read_spec(SweepSpec, spec, "studies")
     folder, runs = check_target(out, MARKER, overwrite=True), list(runs_of(read))
     made = _made(read, folder)
     return len(runs), sum(not _file_of(folder, made, run).is_file() for run in runs)
-
-
-def _read(spec: str | Path | Mapping[str, Any] | SweepSpec) -> SweepSpec:
-    if isinstance(spec, Mapping):
-        return validate(SweepSpec, dict(spec), None, {})
-    return spec if isinstance(spec, SweepSpec) else read_sweep(spec)
 
 
 def _made(spec: SweepSpec, folder: Path) -> _Studies | _Recordings:
@@ -258,7 +253,7 @@ class _Studies:
         keys = run.keys("")
         if run.keys(_ISP):
             raise SpecError("keys of the ISP are for sweeps of recordings")
-        data = load_yaml(self._file)
+        data = read_yaml(self._file)
         if run.keys(_SENSOR):
             data["sensor_keys"] = {**data.get("sensor_keys", {}), **run.keys(_SENSOR)}
         if "seeds" in self._spec.model_fields_set:

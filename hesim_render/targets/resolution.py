@@ -186,7 +186,7 @@ def zone_plate(target: ZonePlateTarget) -> list[TargetPiece]:
 
 
 def dead_leaves(target: DeadLeavesTarget) -> list[TargetPiece]:
-    """Discs that hide each other, from the front to the back, until nothing is left uncovered.
+    """Discs that occlude each other, from the front to the back, until nothing is left uncovered.
 
     A texel has the grey of the front-most disc over its centre [cao2010]. Discs fall evenly on the target widened by
     the largest radius, so that the texture is the same everywhere.

@@ -139,13 +139,13 @@ def test_a_column_is_judged_from_25_events_and_25_trials_without_one(monkeypatch
     events = np.array([[[9, 11, 2], [11, 40, 2]], [[12, 14, 5], [17, 37, 1]]])
     silent = 50 - events.sum(axis=2)
     counts = SimpleNamespace(
-        log_likelihood=lambda values, grid, law: np.zeros((2, 3)), polarity=1, events=events.reshape(2, 6),
-        silent=silent, sets=[SimpleNamespace(contrast=np.array([0.2, -0.2]))],
+        polarity=1, events=events.reshape(2, 6), silent=silent, sets=[SimpleNamespace(contrast=np.array([0.2, -0.2]))],
     )  # fmt: skip
     monkeypatch.setattr(checks, "chances", lambda *_: np.broadcast_to(chance[..., None], (2, 3, 3)))
-    monkeypatch.setattr(checks, "log_prior", lambda theta, mismatch, grid: np.zeros(3))
     likelihood = SimpleNamespace(counts=[counts], grids=[np.arange(3.0)])
-    columns = checks._columns(SimpleNamespace(likelihood=likelihood, values=np.zeros(12), law="sqrt"))
+    given = np.full((2, 3), 1 / 3)
+    fit = SimpleNamespace(likelihood=likelihood, values=np.zeros(12), law="sqrt", law_given=lambda counts: given)
+    columns = checks._columns(fit)
     assert columns.expected == pytest.approx([26, 20, 74]) and columns.silent == pytest.approx([74, 80, 26])
     assert columns.residual == pytest.approx(np.array([[-2, 1, 3], [1, 7, 0]])) and columns.family.tolist() == [1, 0, 1]
 
@@ -161,9 +161,9 @@ def test_events_where_there_can_be_none_are_counted_in_those_trials_alone(monkey
     steady = replace(steps, signal_dn=np.array([100.0]), contrast=np.zeros(1), calm=np.full((1, 3), 400), on=0 * on[:1])
     steady = replace(steady, off=steady.on)
     monkeypatch.setattr(defects, "chances", lambda _, trials, *__: chance[: len(trials.contrast), None])
-    monkeypatch.setattr(defects, "log_prior", lambda *_: np.zeros(2))
-    monkeypatch.setattr(defects.TrialCounts, "log_likelihood", lambda *_: np.zeros((3, 2)))
-    fit = SimpleNamespace(values=np.zeros(12), law="sqrt", likelihood=SimpleNamespace(grids=[np.array([0.2, 0.3])] * 2))
+    likelihood = SimpleNamespace(grids=[np.array([0.2, 0.3])] * 2)
+    given = np.full((3, 2), 0.5)
+    fit = SimpleNamespace(values=np.zeros(12), law="sqrt", likelihood=likelihood, law_given=lambda counts: given)
     found = defects._tests(fit, steady, steps, 1)
     assert found.tolist() == [[False] * 3, [False, False, True], [False, True, False]]
 

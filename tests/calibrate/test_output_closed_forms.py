@@ -11,6 +11,7 @@ from hesim_render.calibrate.aps import pairs_output
 from hesim_render.calibrate.aps.common_mode import Shared
 from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal
+from hesim_render.calibrate.asynchronous import likelihood
 from hesim_render.calibrate.asynchronous import output as trials_output
 
 #: Half of an interval of 95 % of a normal law, errors.
@@ -252,7 +253,7 @@ def test_beta_and_noise_of_trials_have_errors_of_the_delta_method(law, power):
     covariance = covariance.T @ covariance * 1e-6
     r, s, d = 0.07, 0.0013, 0.0009
     values = np.zeros(len(names))
-    values[[*of.THETA, of.RESPONSE, of.SHOT, of.DARK]] = 0.21, 0.29, r, s, d
+    values[[*likelihood.THETA, of.RESPONSE, of.SHOT, of.DARK]] = 0.21, 0.29, r, s, d
     fit = SimpleNamespace(
         values=values, covariance=covariance, law=law, free=np.ones(len(names), bool),
         value=lambda name: values[names.index(name)],

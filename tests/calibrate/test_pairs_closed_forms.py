@@ -9,6 +9,8 @@ from scipy.stats import gamma
 
 from hesim_render.calibrate.aps import light_curve, noise_spectrum, spatial
 from hesim_render.calibrate.aps.pair_levels import Levels, pair_statistics
+from hesim_render.calibrate.aps.pairs_required import require_steady_light
+from hesim_render.core.errors import SpecError
 
 X = np.array([1.0, 2.5, 4.0, 7.0, 11.0])
 
@@ -314,3 +316,20 @@ def test_the_spectrum_of_frames_has_one_degree_of_freedom_less_than_frames(monke
     assert found.lines == [] and found.correlation_error == pytest.approx(1 / np.sqrt(2 * 20 * 27))
     turn = np.cos(2 * np.pi * np.arange(1, 14) / 27)
     assert found.correlation == pytest.approx(np.sum(inside * turn) / inside.sum() + 1 / 26)
+
+
+@pytest.mark.parametrize(("level", "off", "is_clear", "is_refused"), [
+    (0.5, 1.021, True, True), (0.5, 0.979, True, True), (0.5, 1.019, True, False), (0.5, 1.021, False, False),
+    (0.021, 1.021, True, True), (0.019, 1.021, True, False),
+])  # fmt: skip
+def test_light_that_is_off_by_two_percent_is_refused(level, off, is_clear, is_refused):
+    """From a fiftieth of the largest signal on, and only of levels that are clear of saturation."""
+    light = np.array([level, 1.0])
+    signal, clear = light * [off, 1.0], np.array([is_clear, True])
+    errors = [SimpleNamespace(error=lambda text, k=k: SpecError(f"{k}: {text}")) for k in range(2)]
+    curve, pairs = SimpleNamespace(at=lambda light: light), SimpleNamespace(lit=errors)
+    if not is_refused:
+        require_steady_light(pairs, curve, light, signal, clear)
+        return
+    with pytest.raises(SpecError, match=r"^0: the light drifts between exposures: this pair is 2\.1 % off"):
+        require_steady_light(pairs, curve, light, signal, clear)

@@ -17,7 +17,7 @@ from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.core.errors import RangeError
 from hesim_render.core.progress import Pace, ProgressReport
 from hesim_render.core.shipped import data_folder, list_names, read_keys
-from hesim_render.specs.files import load_yaml
+from hesim_render.core.yaml_file import read_yaml
 
 DOCS = data_folder("sensors").parent / "docs"
 STILL = ["simulate", "colorchecker", "--sensor", "reference-mono", "--roi", "16x12", "--duration", "0.02"]
@@ -232,7 +232,7 @@ def test_lists_as_json_agree_with_the_files(capsys):
         assert list(found) == list_names(kind)
         for name in list_names(kind)[:: 7 if kind == "scenes" else 1]:
             file = data_folder(kind) / f"{name}.yaml"
-            whole = load_yaml(file)
+            whole = read_yaml(file)
             assert found[name]["description"] == whole.get("description", "")
             keys = ("geometry", "tile", "pixels", "evs_grid")
             assert read_keys(file, keys) == {key: whole[key] for key in keys if key in whole}

@@ -15,7 +15,8 @@ import hesim_render as hr
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.core.shipped import data_folder
 from hesim_render.exchange import open_events
-from hesim_render.specs.run import read_run
+from hesim_render.specs.files import read_spec
+from hesim_render.specs.run import RunSpec
 
 RUN = """\
 schema_version: 1
@@ -146,7 +147,7 @@ def test_a_run_that_was_interrupted_after_its_recording_goes_on(tmp_path, capsys
 def test_the_example_of_the_page_is_a_valid_file(tmp_path):
     page = (data_folder("sensors").parent / "docs" / "cli.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
-    spec = read_run(write(tmp_path, text))
+    spec = read_spec(RunSpec, write(tmp_path, text))
     assert (spec.scene, spec.sensor, spec.roi, spec.view) == ("rotating-star", "gen2", "256x192", True)
     assert spec.isp is not None and not spec.isp.denoise and [step.format for step in spec.export] == ["evt3", "png"]
 

@@ -20,8 +20,8 @@ import hesim_render as hr
 from hesim_render import cli
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
 from hesim_render.core.npz import read_array, read_arrays
+from hesim_render.core.yaml_file import read_yaml
 from hesim_render.recording.recording import Recording
-from hesim_render.specs.files import load_yaml
 
 ROOT = Path(__file__).parents[2]
 
@@ -324,10 +324,10 @@ def test_events_must_be_as_many_as_the_manifest_says(folder):
 def test_yaml_that_means_more_than_it_says(tmp_path, text):
     (tmp_path / "s.yaml").write_text(text)
     begin = time.process_time()
-    refused(lambda: load_yaml(tmp_path / "s.yaml"), r"s\.yaml")
+    refused(lambda: read_yaml(tmp_path / "s.yaml"), r"s\.yaml")
     assert time.process_time() - begin < 5
     (tmp_path / "s.yaml").write_text("a: &a {b: 1}\nc: *a\nd: {<<: *a, e: 2*3}\n")
-    assert load_yaml(tmp_path / "s.yaml")["c"]["b"] == 1
+    assert read_yaml(tmp_path / "s.yaml")["c"]["b"] == 1
 
 
 def test_names_are_printed_without_what_a_terminal_obeys(folder, capsys):

@@ -80,16 +80,17 @@ def studies(folder):
 
 
 def read_studies(folder):
-    from hesim_render.specs.design import read_design
-    from hesim_render.specs.filter_set import read_filter_set, read_palette
-    from hesim_render.specs.study import read_study
-    from hesim_render.specs.sweep import read_sweep
+    from hesim_render.specs.design import DesignSpec
+    from hesim_render.specs.files import read_spec
+    from hesim_render.specs.filter_set import FilterSetSpec, PaletteSpec
+    from hesim_render.specs.study import StudySpec
+    from hesim_render.specs.sweep import SweepSpec
 
-    for read, name in (
-        (read_study, "study"), (read_design, "design"), (read_sweep, "sweep"), (read_filter_set, "set"),
-        (read_palette, "palette"),
+    for model, name in (
+        (StudySpec, "study"), (DesignSpec, "design"), (SweepSpec, "sweep"), (FilterSetSpec, "set"),
+        (PaletteSpec, "palette"),
     ):  # fmt: skip
-        read(folder / f"{name}.yaml")
+        read_spec(model, folder / f"{name}.yaml")
 
 
 def cubes(folder):
@@ -183,7 +184,8 @@ def run_file(folder):
 
 
 def read_run(folder):
-    from hesim_render.specs.run import read_run as read
+    from hesim_render.specs.files import read_spec
+    from hesim_render.specs.run import RunSpec
 
-    for step in read(folder / "r.yaml").export:
+    for step in read_spec(RunSpec, folder / "r.yaml").export:
         assert (folder / step.out).resolve().parent == folder.resolve()

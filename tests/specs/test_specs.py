@@ -10,9 +10,10 @@ import pytest
 from pydantic import BaseModel
 
 from hesim_render.core.errors import HesimWarning, RangeError, SpecError
+from hesim_render.core.yaml_file import read_yaml
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.reading import read_sensor
-from hesim_render.specs import SceneSpec, SensorSpec, files, read_scene
+from hesim_render.specs import SceneSpec, SensorSpec, read_scene
 from hesim_render.specs.event_pixels import EvsSpec
 from hesim_render.specs.files import (
     Strict,
@@ -20,7 +21,6 @@ from hesim_render.specs.files import (
     content_hash,
     data_folder,
     list_names,
-    load_yaml,
     parse_override,
 )
 from hesim_render.specs.frame_pixels import ApsSpec
@@ -199,7 +199,7 @@ def test_hash_is_of_the_content_only(tmp_path):
 def test_shipped_sensor_files_say_where_every_number_is_from(name):
     spec = read_sensor(name)
     assert spec.name == name and spec.description
-    data = files.load_yaml(data_folder("sensors") / f"{name}.yaml")
+    data = read_yaml(data_folder("sensors") / f"{name}.yaml")
     told = {*spec.sources, *spec.assumptions}
     untold = [
         key
@@ -468,7 +468,7 @@ def test_limits_and_defaults_of_numbers_are_round():
 
 def test_items_of_lists_are_set_by_their_numbers(tmp_path):
     (tmp_path / "a.yaml").write_text("a:\n- {b: 1, c: [3, 4, 5]}\n- 7\nd: 2\n")
-    data = load_yaml(tmp_path / "a.yaml")
+    data = read_yaml(tmp_path / "a.yaml")
     apply_overrides(data, {"a.0.c.1": 8, "a.1": {"e": 9}, "d": [1], "f.g": 6})
     assert data == {"a": [{"b": 1, "c": [3, 8, 5]}, {"e": 9}], "d": [1], "f": {"g": 6}}
     for key, most in (("a.2", 1), ("a.0.c.x", 2), ("a.0.c.3", 2)):

@@ -13,8 +13,8 @@ import hesim_render as hr
 from hesim_render import cli
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
-from hesim_render.specs.design import DesignSpec, read_design
-from hesim_render.specs.files import list_names
+from hesim_render.specs.design import DesignSpec
+from hesim_render.specs.files import list_names, read_spec
 from hesim_render.specs.filter_set import read_filter_set
 from hesim_render.specs.run import StudyKind, study_kind
 from hesim_render.spectral import spectrum as spectra
@@ -403,7 +403,7 @@ def test_a_verdict_says_what_got_better_and_worse():
 @pytest.mark.slow
 def test_the_shipped_design_beats_the_camera_on_colours_and_lights_that_it_has_not_seen(tmp_path):
     """Weights, levels and both sets of colours are those of the shipped file; 95 reflectances under three lights."""
-    spec = read_design("rggb-dyes")
+    spec = read_spec(DesignSpec, "rggb-dyes", "studies")
     assert spec.fit.reflectances != spec.judge.reflectances
     assert not {light.name for light in spec.fit.illuminants} & {light.name for light in spec.judge.illuminants}
     (verdict,) = design(spec, out=tmp_path / "out").verdicts
@@ -480,7 +480,7 @@ def test_shipped_designs_load():
     designs = [name for name in list_names("studies") if study_kind(name) is StudyKind.design]
     assert len(designs) == 3
     for name in designs:
-        assert Problem(read_design(name)).starts()
+        assert Problem(read_spec(DesignSpec, name, "studies")).starts()
 
 
 @pytest.mark.parametrize(("tile_px", "shares"), [(None, {"red": 0.5}), ([4, 4], None), (None, None)])

@@ -15,10 +15,10 @@ from hesim_render.core.drawing import report_style
 from hesim_render.core.errors import OutputError, RangeError, SpecError
 from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
 from hesim_render.sources.crosstalk import mixed
-from hesim_render.specs.files import list_names
+from hesim_render.specs.files import list_names, read_spec
 from hesim_render.specs.filter_set import read_filter_set, read_palette
 from hesim_render.specs.run import StudyKind, study_kind
-from hesim_render.specs.study import read_study
+from hesim_render.specs.study import StudySpec
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.studies import Table, channel_noise, verdict, with_filter_set
 from hesim_render.studies import report as study_report
@@ -242,7 +242,8 @@ def test_every_shipped_filter_set_stands_before_a_sensor():
     comparisons = [name for name in list_names("studies") if study_kind(name) is StudyKind.comparison]
     assert len(comparisons) == 5
     for name in comparisons:
-        assert len(read_study(name).filter_sets) + len(read_study(name).sensors) > 2
+        spec = read_spec(StudySpec, name, "studies")
+        assert len(spec.filter_sets) + len(spec.sensors) > 2
     palette = read_palette("dyes")
     # the infrared cut keeps what cannot be rendered out
     assert float(palette.quantum_efficiency.load().at(720)) < 1e-3

@@ -13,9 +13,9 @@ from hesim_render import cli
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.isp import Pipeline, process
 from hesim_render.sources.render.audit.audit import Audit
-from hesim_render.specs.files import data_folder
+from hesim_render.specs.files import data_folder, read_spec
 from hesim_render.specs.run import StudyKind, study_kind
-from hesim_render.specs.sweep import RangeSpec, read_sweep
+from hesim_render.specs.sweep import RangeSpec, SweepSpec
 from hesim_render.studies import sweep as sweeps
 from hesim_render.studies import sweep_metrics
 from hesim_render.studies.sweep import sweep
@@ -197,7 +197,10 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
 def test_ranges_and_files(tmp_path, capsys):
     assert RangeSpec(first=1, last=1000, count=4, scale="log").values() == [1, 10, 100, 1000]
     assert RangeSpec(first=0, last=1, count=5).values() == [0, 0.25, 0.5, 0.75, 1]
-    assert study_kind("light-and-exposure") is StudyKind.sweep and read_sweep("light-and-exposure").vary
+    assert (
+        study_kind("light-and-exposure") is StudyKind.sweep
+        and read_spec(SweepSpec, "light-and-exposure", "studies").vary
+    )
     file = tmp_path / "sweep.yaml"
     file.write_text(json.dumps({**BASE, "vary": {}, "seeds": [5], "keep": True, "options": {"samples": 512}}))
     with pytest.raises(SystemExit) as stop:

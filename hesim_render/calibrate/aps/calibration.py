@@ -142,17 +142,22 @@ def analyse(
     """
     spec = captures.spec
     tile, positions = (spec.tile_rows, spec.tile_cols), frame_positions(captures)
+    # noise that a row shares would count as noise of each pixel: it is measured, and taken out of all variances
     rows = row_noise(dark_moments, used)
     row_variance = rows.variance if rows.significant else 0.0
     if row_variance:
         dark_moments, lit = (without_rows(m, used, spec.full_scale_dn, row_variance) for m in (dark_moments, lit))
+    # black level and dark current, and from them the light alone, [exposure, row, col]
     dark = fit_dark(dark_moments, used, spec.full_scale_dn, row_variance)
     signals = np.stack([light_signal(lit, dark, k) for k in range(lit.exposures_s.size)])
+    # pixels that decide figures; the others are only judged
     good = used & ~dark.bad & ~dark.hot & ~telegraph.is_telegraph
     _check_light(dark, lit, signals, good, spec.full_scale_dn)
     saturation = saturation_dn(lit, signals, good, spec.full_scale_dn)
     dark_clear = (dark_moments.lowest > 0) & (dark_moments.highest < spec.full_scale_dn)
 
+    # what is clear of clipping depends on the noise, and the noise is fitted to what is clear: two rounds of both.
+    # Within each, pixels that the polynomial does not describe drop out, and it is fitted once more without them.
     beta: NDArray | None = None
     bad = used & (dark.bad | telegraph.is_telegraph)
     for _ in range(2):
@@ -170,12 +175,15 @@ def analyse(
             beta = np.zeros((*tile, 6))
             for position, fit in fits.items():
                 beta[position] = fit.beta
+            # judged by all their exposures, [row, col]
             unlike = used & _unlike_their_kind(beta, dark_moments, lit, signals, dark_clear, usable)
             if not np.any(unlike & ~bad):
                 break
             bad |= unlike
+    # the scene without noise, from all exposures; it shows pixels without a response as well
     composite = compose(lit, dark, usable, np.zeros((*tile, 6)) if beta is None else beta)
     bad |= used & _unresponsive(composite, tile)
+    # the brightest signal: that at which pixels saturate, or else the end of the ADC above black
     top = spec.full_scale_dn - dark.black if saturation is None else saturation
     reached = saturation is not None or bool(np.mean(lit.highest[:, used] >= spec.full_scale_dn) > 1e-4)
     linear = linearity(lit, signals, usable & good, composite, top)
@@ -189,6 +197,7 @@ def _check_light(
 ) -> None:
     if np.mean(lit.highest[:, good] >= full_scale_dn) > 0.98:
         raise SpecError("the lit frames are saturated at every exposure; capture shorter exposures or less light")
+    # the longest exposure must stand out of its own noise
     k = len(signals) - 1
     t = lit.exposures_s[k]
     noise = np.sqrt(np.median(lit.variance[k][good]) / lit.frames + dark.mean_variance(t))
@@ -216,6 +225,7 @@ def _fit(
         cut = np.s_[position[0] :: tile[0], position[1] :: tile[1]]
         parts = []
         for k, t in enumerate(dark_moments.exposures_s):
+            # values of one tile position, pooled by signal; dark frames give the constant terms
             take = good[cut] & dark_clear[k][cut]
             variance = dark_moments.variance[k][cut][take]
             parts.append(pool(np.zeros(variance.size), variance, t, 0.0, dark_moments.frames, False, row_variance))
@@ -253,6 +263,7 @@ def _unlike_their_kind(
     -------
     [row, col].
     """
+    # χ² of each pixel over all exposures, less what is expected, [row, col]
     ratio = np.zeros(lit.mean.shape[1:])
     freedom = np.zeros_like(ratio)
     for moments, mask, signal in ((dark, dark_clear, None), (lit, usable, signals)):
@@ -261,6 +272,7 @@ def _unlike_their_kind(
             expected = np.maximum(variance_map(beta, light, t), 0) + ADC_VARIANCE_DN2
             ratio += np.where(mask[k], (moments.frames - 1) * (moments.variance[k] / expected - 1), 0.0)
             freedom += np.where(mask[k], moments.frames - 1, 0)
+    # a χ² of k degrees of freedom has the variance 2k
     spread = np.sqrt(2 * np.maximum(freedom, 1))
     scaled = ratio / spread
     # A polynomial that fits poorly somewhere must not make the pixels there bad: compare with the actual spread.
@@ -274,6 +286,7 @@ def _unresponsive(composite: Composite, tile: tuple[int, int]) -> NDArray[np.boo
     for i, j in np.ndindex(tile):
         rate = composite.rate_dn_per_s[i :: tile[0], j :: tile[1]]
         error = composite.standard_error_dn_per_s[i :: tile[0], j :: tile[1]]
+        # the third lowest of the nine: two dead neighbours do not make a pixel look alive
         around = rank_filter(np.nan_to_num(rate, nan=0.0), 2, size=3)
         unresponsive[i :: tile[0], j :: tile[1]] = (rate < 0.02 * around) & (around - rate > 10 * error)
     return unresponsive

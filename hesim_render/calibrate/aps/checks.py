@@ -159,6 +159,7 @@ def _line(result: ApsCalibration, dark: FrameMoments, rows: float) -> Finding | 
     good = ~result.bad & ~result.dark.bad & ~result.dark.hot
     if t.size < 3 or good.sum() < _FEWEST:
         return None
+    # mean level of all good pixels at each exposure, and its variance: rows that move together average less
     mean = np.array([float(m[good].mean(dtype=np.float64)) for m in dark.mean])
     noise = np.array([float(v[good].mean(dtype=np.float64)) / good.sum() for v in dark.variance])
     variance = (noise + rows / dark.mean.shape[1]) / dark.frames
@@ -263,6 +264,7 @@ def _curvature(result: ApsCalibration) -> Finding | None:
     known = {p: f.cubic for p, f in result.fits.items() if f.cubic is not None}
     if not known:
         return None
+    # one test for all positions: the sum of squares of their z-scores is χ²
     z = {p: value / error for p, (value, error) in known.items()}
     p_value = float(chi2_law.sf(sum(v * v for v in z.values()), len(z)))
     if p_value > ALARM:

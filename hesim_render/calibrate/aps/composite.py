@@ -18,6 +18,8 @@ from hesim_render.spectral import spectrum as spectra
 _CLEAR_SIGMAS = 6.0
 #: Relative standard deviation of the frame pixels around an event pixel above which its signal is uncertain.
 _UNEVEN = 0.1
+#: σ of the Gaussian that interpolates, px; it is widened where no frame pixel is near.
+_SIGMA_PX = 1.0
 #: Factor of their noise variance by which a few of them may scatter.
 _NOISE_MARGIN = 3.0
 
@@ -56,10 +58,12 @@ def saturation_dn(lit: FrameMoments, signals: NDArray, good: NDArray[np.bool_], 
     t = lit.exposures_s
     levels = []
     for k in range(1, t.size):
+        # what a straight response would give after the shorter exposure, and its noise
         predicted = signals[k - 1] * (t[k] / t[k - 1])
         noise = np.sqrt(np.maximum(lit.variance[k - 1], ADC_VARIANCE_DN2) / lit.frames) * (t[k] / t[k - 1])
         over = good & (predicted - 6 * noise > 1.15 * signals[k]) & (lit.highest[k] < full_scale_dn)
         if over.sum() >= max(20, 5e-4 * good.sum()):
+            # pixels that fall short all stop at one level where it is a full well, and at many where the light changed
             level = float(np.median(signals[k][over]))
             if np.median(np.abs(signals[k][over] - level)) < 0.05 * level:
                 levels.append(level)
@@ -107,6 +111,7 @@ def compose(lit: FrameMoments, dark: DarkModel, usable: NDArray[np.bool_], beta:
     for k, t in enumerate(lit.exposures_s):
         signal = light_signal(lit, dark, k)
         noise = (np.maximum(variance_map(beta, signal, t), 0) + ADC_VARIANCE_DN2) / lit.frames
+        # inverse variance of the mean of the frames, that of the dark level included
         weight = np.where(usable[k], 1 / (noise + dark.mean_variance(t)), 0.0)
         top += weight * signal * t
         bottom += weight * t * t
@@ -117,7 +122,7 @@ def compose(lit: FrameMoments, dark: DarkModel, usable: NDArray[np.bool_], beta:
 
 
 def signal_at_event_pixels(
-    composite: Composite, sensor: SensorSpec, illuminant: str | None = None, sigma_px: float = 1.0
+    composite: Composite, sensor: SensorSpec, illuminant: str | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Composite at the event pixels, on the event grid [y, x], DN/s, and where it is not to be relied on.
 
@@ -156,11 +161,12 @@ def signal_at_event_pixels(
             values = rate_dn_per_s[i::height, j::width]
             differ = np.zeros(values.shape, bool)
         else:
+            # the frame values that tell the signal of this filter, each in its units, on an otherwise empty mosaic
             scaled, noise = np.full((2, *rate_dn_per_s.shape), np.nan)
             for (a, b), ratio in _like_it(sensor, pixel.filter, illuminant).items():
                 cut = np.s_[a::height, b::width]
                 scaled[cut], noise[cut] = ratio * rate_dn_per_s[cut], ratio * error[cut]
-            values, differ = (v[i::height, j::width] for v in _smoothed(scaled, noise, sigma_px, max(height, width)))
+            values, differ = (v[i::height, j::width] for v in _smoothed(scaled, noise, _SIGMA_PX, max(height, width)))
         a, b = divmod(k, grid.cols_per_tile)
         signal[a :: grid.rows_per_tile, b :: grid.cols_per_tile] = values
         uneven[a :: grid.rows_per_tile, b :: grid.cols_per_tile] = differ
@@ -179,6 +185,7 @@ def _like_it(sensor: SensorSpec, name: str, illuminant: str | None) -> dict[tupl
         response = sensor.filter_response(other)
         spectra.require_coverage(light, response, f"illuminant {illuminant!r}", f"filter {other!r}")
         per_watt = spectra.Spectrum(response.wavelength_nm, response.values * response.wavelength_nm)
+        # electrons, not energy: λ turns watts into photons
         total[other] = spectra.integrate_product(light, per_watt)
     return {p: total[name] / total[other] for p, other in filters.items()}
 
@@ -195,10 +202,12 @@ def _smoothed(
         def blur(image: NDArray, sigma_px: float = sigma_px) -> NDArray:
             return gaussian_filter(image, sigma_px, truncate=3)
 
+        # share of the Gaussian that lies on known values; a wider one follows where there are nearly none
         weight = blur(known.astype(float))
         use = ~np.isfinite(result) & (weight > 1e-3)
         weight = np.maximum(weight, 1e-3)
         mean = blur(filled) / weight
+        # variance within the Gaussian beyond that of the noise: an edge of the scene
         excess = blur(filled * filled) / weight - mean * mean - _NOISE_MARGIN * blur(noise * noise) / weight
         result[use], uneven[use] = mean[use], (excess > (_UNEVEN * mean) ** 2)[use]
         sigma_px *= 2

@@ -65,6 +65,7 @@ def fit_dark(
         If the dark frames are clipped, or their noise is below the steps of the ADC.
     """
     t = moments.exposures_s
+    # [exposure, row, col]; clipping at either end takes part of the noise away, and moves the mean
     valid = (moments.lowest > 0) & (moments.highest < full_scale_dn)
     if np.mean(valid[:, used]) < 0.5:
         clipped_low = np.mean(moments.lowest[:, used] == 0) > 0.4
@@ -74,6 +75,7 @@ def fit_dark(
             if clipped_low
             else "most dark frames reach full scale; cover the lens and shorten the exposures"
         )
+    # noise of each exposure, [exposure]: a median, as hot pixels would raise a mean
     spread = np.array(
         [
             np.median(v[used & ok]) + row_variance_dn2 if np.any(used & ok) else np.nan
@@ -91,14 +93,17 @@ def fit_dark(
         )
     spread[quantised] = np.nan
     valid &= ~quantised[:, None, None]
+    # one weight for all pixels of an exposure, so that one matrix solves all lines at once
     weight = np.where(np.isfinite(spread), moments.frames / np.maximum(spread, ADC_VARIANCE_DN2), 0.0)
     n_fp, n_dp, covariance = _all_pixels(moments.mean, t, weight)
+    # pixels that are clipped at some exposure have a line of their own through the others
     broken = used & ~valid[~quantised].all(axis=0)
     bad = used & (valid.sum(axis=0) < 2)
     n_fp[broken], n_dp[broken] = _masked(moments.mean[:, broken], t, weight, valid[:, broken])
     n_dp[bad | ~used] = 0.0
     good = used & ~bad
     black, n_row, n_blc = split_fixed_pattern(n_fp, good)
+    # χ² needs an exposure more than the two that a line takes
     whole = used & valid[~quantised].all(axis=0)
     freedom = int(np.sum(~quantised)) - 2
     chi2 = None
@@ -107,6 +112,7 @@ def fit_dark(
             w * float(np.mean((m[whole] - (n_fp + n_dp * s)[whole]) ** 2))
             for w, m, s in zip(weight, moments.mean, t, strict=True)
         ) / freedom  # fmt: skip
+    # hot: six robust standard deviations, or six errors of a single pixel where that is more
     middle = float(np.median(n_dp[good]))
     robust = 1.4826 * float(np.median(np.abs(n_dp[good] - middle)))
     limit = middle + 6 * max(robust, np.sqrt(covariance[1, 1]))
@@ -140,6 +146,7 @@ def split_fixed_pattern(
 def _all_pixels(
     mean: NDArray[np.float32], t: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    # weighted least squares [2, exposure]: the coefficients are sums of images with fixed factors
     design = np.stack([np.ones_like(t), t])
     covariance: NDArray[np.float64] = np.linalg.inv((design * weight) @ design.T).astype(np.float64)
     solve = covariance @ (design * weight)
@@ -158,6 +165,7 @@ def _masked(
     w = weight[:, None] * valid
     total = np.maximum(w.sum(axis=0), 1e-30)
     t_mean, y_mean = (w * t[:, None]).sum(axis=0) / total, (w * mean).sum(axis=0) / total
+    # about the weighted means of each pixel the normal equations have no mixed term
     centred = t[:, None] - t_mean
     slope = (w * centred * mean).sum(axis=0) / np.maximum((w * centred**2).sum(axis=0), 1e-30)
     return y_mean - slope * t_mean, slope

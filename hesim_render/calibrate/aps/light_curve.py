@@ -48,10 +48,12 @@ def through_origin(x: NDArray, y: NDArray, covariance: NDArray | None) -> Line:
     slope = float(x @ y) / total
     residual = y - slope * x
     if covariance is None:
+        # each residual as if its own point had not been fitted
         leverage = x**2 / total
         error = float(np.sqrt(np.sum((x * residual / (1 - leverage)) ** 2))) / total
         return Line(slope, error, float("nan"), x.size)
     chi2 = float(np.sum(residual**2 / np.diag(covariance))) / max(x.size - 1, 1)
+    # of stated errors; larger where the points scatter by more
     error = float(np.sqrt(x @ covariance @ x)) / total
     if chi2_law.sf(chi2 * (x.size - 1), x.size - 1) < _MISFIT:
         error *= float(np.sqrt(chi2))

@@ -24,7 +24,13 @@ from hesim_render.calibrate.aps.light_curve import (
 )
 from hesim_render.calibrate.aps.long_series import Long, long_series, stuck_pixels
 from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
-from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, Levels, both_levels
+from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, Levels, both_levels
+from hesim_render.calibrate.aps.pairs_required import (
+    require_dark_noise,
+    require_one_colour,
+    require_series_below_well,
+    require_steady_light,
+)
 from hesim_render.calibrate.aps.spatial import Pattern, outliers, pattern_of
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance
 from hesim_render.calibrate.moments import Progress
@@ -39,12 +45,6 @@ _FIT_TOP = 0.7
 _LONG_AT = 0.5
 #: Dark variance as measured, DN², below which EMVA 1288 gives the dark noise no value but a limit, and that limit, DN.
 _LEAST_DARK_DN2, DARK_NOISE_LIMIT_DN = 0.24, 0.49
-#: Scatter of the light from exposure to exposure that is refused.
-_MOST_SCATTER = MOST_CHANGE
-#: Relative differences of the places of a tile from which they are colours.
-_MOSAIC = 0.08
-#: Part of the largest temporal variance below which a brighter series is at the full well.
-_WELL_PART = 0.5
 _FEWEST_CLEAR = 5
 #: Memory of an evaluation, most of it transforms of frames in double precision.
 _BYTES_PER_PIXEL = 200
@@ -147,15 +147,18 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
         With file and line, if the captures are saturated, clipped at 0, or lit by light that drifts.
     """
     require_memory(_BYTES_PER_PIXEL * pairs.shape[0] * pairs.shape[1], "maps and transforms of a frame", pairs.file)
+    # mean and temporal variance of every level, from pairs of frames; where they saturate the variance falls again
     lit, dark = both_levels(pairs, progress)
     signal, light = lit.mean - dark.mean, light_of(pairs, lit)
     saturation = _saturation(lit)
+    # of several long series, the one that the standard asks for
     pairs = pairs.with_long_at(_LONG_AT * float(light[min(saturation, light.size - 1)]))
     long_dark, long_lit = long_series(pairs, progress)
-    _check_dark(pairs, dark, long_dark)
-    _check_long(pairs, long_lit, lit, saturation)
-    _check_mosaic(pairs, long_lit.mean - long_dark.mean)
+    require_dark_noise(pairs, dark, long_dark)
+    require_series_below_well(pairs, long_lit, lit, saturation)
+    require_one_colour(pairs, long_lit.mean - long_dark.mean)
     top = float(signal[min(saturation, signal.size - 1)])
+    # levels of whose variance nothing is cut off
     clear = lit.clear & (np.arange(signal.size) < saturation) & (signal > 0)
     if clear.sum() < _FEWEST_CLEAR:
         last = pairs.lit[min(int(clear.sum()), signal.size - 1)]
@@ -167,6 +170,7 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     if light[clear].min() == light[clear].max():
         raise pairs.lit[0].error("all lit pairs have one light; EMVA 1288 needs many, up to saturation")
     row, col = _shared(dark, long_dark)
+    # photon transfer: K is the slope of the variance above the dark against the signal
     use = clear & (signal <= _FIT_TOP * top)
     difference = lit.variance - dark.variance
     gain = through_origin(signal[use], difference[use], _difference_covariance(pairs, lit, dark, use))
@@ -174,17 +178,23 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
         raise SpecError(
             "the variance does not rise with the light; no gain follows from these captures", file=pairs.file
         )
+    # responsivity: the slope of the signal against the light, with errors from its own scatter
     responsivity = through_origin(light[use], signal[use], None)
+    # a level is the mean of two frames of all pixels: its error is what rows share, and the noise of the pixels
     shared_error = np.sqrt((max(row[0], 0.0) + long_dark.temporal.pixel / pairs.shape[1]) / pairs.shape[0] / 2)
     distinct = np.unique(dark.exposure_s, return_index=True)[1]
+    # dark current and dark noise: straight lines against the exposure
     black = straight(dark.exposure_s[distinct], dark.mean[distinct], np.full(distinct.size, max(shared_error, 1e-6)))
     noise = straight(dark.exposure_s[distinct], dark.variance[distinct], dark.error[distinct])
+    # beyond the standard: the curve bends, and light may be more than stated
     curve = mean_curve(light[clear], signal[clear], np.full(int(clear.sum()), np.hypot(shared_error, black.rms)))
-    _check_light(pairs, curve, light, signal, clear)
+    require_steady_light(pairs, curve, light, signal, clear)
+    # the variance as a polynomial, with errors that include the scatter of whole levels
     bins = _bins(pairs, lit, dark, signal, clear, distinct)
     fit = _variance_fit(bins)
     level_chi2, level_chance, level_rms = _scatter(pairs, lit, signal, clear, fit)
     fit = _widened(fit, level_chi2)
+    # fixed patterns from the long series, without the noise of their means; pixels unlike the others are defects
     dark_pattern = pattern_of(long_dark.mean, long_dark.spatial.noise, long_dark.spectrum, long_dark.frames)
     relative, relative_noise = _relative(long_lit, long_dark, curve, light[clear])
     light_pattern = pattern_of(relative, relative_noise)
@@ -197,57 +207,11 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     )  # fmt: skip
 
 
-def _check_dark(pairs: PairSet, dark: Levels, long_dark: Long) -> None:
-    for k, entry in enumerate(pairs.dark):
-        if dark.low[k] > 0.01:
-            raise entry.error(
-                f"{100 * dark.low[k]:.3g} % of the dark pixels are 0 DN, which hides a part of the noise; raise the "
-                "black level (offset)"
-            )
-    if long_dark.temporal.pixel <= 0:
-        raise pairs.spatial_dark.error("the frames do not differ")
-
-
-def _check_long(pairs: PairSet, long_lit: Long, lit: Levels, saturation: int) -> None:
-    """Refuse a long series at the full well, where the light makes no noise any more and no spread over pixels."""
-    if saturation >= lit.mean.size:
-        return
-    if long_lit.mean.mean() >= lit.mean[saturation] and long_lit.temporal.pixel < _WELL_PART * lit.variance[saturation]:
-        raise pairs.spatial_lit.error(
-            f"the long series is saturated, at {long_lit.mean.mean():.0f} DN; EMVA 1288 takes it at 50 % of saturation"
-        )
-
-
-def _check_mosaic(pairs: PairSet, signal: NDArray) -> None:
-    """Refuse frames whose places of a 2x2 tile have signals of their own, far apart beside the pixels' spread."""
-    rows, cols = (count - count % 2 for count in signal.shape)
-    places = signal[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2).transpose(1, 3, 0, 2).reshape(4, -1)
-    middle = np.median(places, axis=1)
-    spread = np.median(np.abs(places - middle[:, None])) / 0.6745
-    if np.ptp(middle) > max(_MOSAIC * middle.mean(), 3 * spread):
-        shares = ", ".join(f"{100 * value / middle.max():.0f}" for value in middle)
-        raise pairs.spatial_lit.error(
-            f"the places of a 2x2 tile have {shares} % of the largest signal: a colour mosaic. EMVA 1288 evaluates one "
-            "colour at a time; state tile_rows: 2, tile_cols: 2 and tile_position: [row, column] in capture.yaml"
-        )
-
-
 def _saturation(lit: Levels) -> int:
     """Number of the level whose variance is largest; the number of levels where it rises to the end."""
     whole = lit.variance + np.maximum(lit.row, 0.0)
     k = int(np.argmax(whole))
     return whole.size if k == whole.size - 1 and lit.high[k] <= CLIPPED_SHARE else k
-
-
-def _check_light(pairs: PairSet, curve: MeanCurve, light: NDArray, signal: NDArray, clear: NDArray[np.bool_]) -> None:
-    expected = curve.at(light)
-    deviation = np.where(clear, np.abs(signal / expected - 1), 0.0)
-    deviation[signal < 0.02 * signal.max()] = 0.0  # offsets and dark drift weigh more than light there
-    k = int(np.argmax(deviation))
-    if deviation[k] > _MOST_SCATTER:
-        raise pairs.lit[k].error(
-            f"the light drifts between exposures: this pair is {100 * deviation[k]:.2g} % off the curve of all others"
-        )
 
 
 def _shared(dark: Levels, long_dark: Long) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -270,6 +234,7 @@ def _shared(dark: Levels, long_dark: Long) -> tuple[tuple[float, float], tuple[f
 def _difference_covariance(pairs: PairSet, lit: Levels, dark: Levels, use: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Covariance of lit less dark variances; levels that have one dark pair share its error."""
     numbers = np.flatnonzero(use)
+    # a dark pair that serves several levels moves them together
     same = np.array([[pairs.dark[i] is pairs.dark[j] for j in numbers] for i in numbers])
     return np.diag(lit.error[use] ** 2) + same * np.outer(dark.error[use], dark.error[use])
 
@@ -279,6 +244,7 @@ def _bins(
 ) -> Pooled:
     """One bin a pair for the fit of the variance polynomial."""
     pixels = float(pairs.shape[0] * pairs.shape[1])
+    # each dark pair once, then the lit ones; sums are those of pixels that all have the mean signal of the level
     light = np.concatenate([np.zeros(distinct.size), signal[clear]])
     variance = np.concatenate([dark.variance[distinct], lit.variance[clear]]) - ADC_VARIANCE_DN2
     raw = np.concatenate([dark.squares[distinct], lit.squares[clear]])
@@ -339,9 +305,11 @@ def _relative(
     expected = pattern_of(dark.mean, dark.spatial.noise, dark.spectrum, dark.frames, expected=True)
     signal = lit.mean - dark.mean.mean() - expected.whole
     level = float(signal.mean())
+    # the light at which the curve gives the mean signal of the series, by a table
     places = np.linspace(float(light.min()), float(light.max()), 512)
     here = float(np.interp(level, curve.at(places), places))
     shifted = here + curve.offset
+    # signal ∝ lightᵉ about there: e is 1 where the curve is straight
     exponent = float(curve.gradient(np.array([here]))[0, 0]) * shifted / float(curve.at(np.array([here]))[0])
     scale = level * exponent
     # of the dark pattern that part is unknown which is as large as what is known of its noise

@@ -37,6 +37,8 @@ def system_gain(bins: Pooled, top_dn: float) -> tuple[float, float]:
     if not np.any(lit):
         return float("nan"), float("nan")
     base = np.array([dark[t] for t in bins.exposure_s[lit]])
+    # sums over the bins of signal² and of signal · variance above the dark; the noise of the signal itself adds to
+    # its square, and is taken off
     x2 = bins.powers[lit, 2] - bins.noise[lit] * bins.pixels[lit]
     above = bins.products[lit, 1] - bins.variance_dn2[base] * bins.powers[lit, 1]
     gain = float(above.sum()) / max(float(x2.sum()), 1e-30)
@@ -61,6 +63,7 @@ def linearity(
     """Deviation of each exposure from proportionality, over pixels between 5 and 95 % of saturation."""
     deviations = []
     for k, t in enumerate(lit.exposures_s):
+        # what a pixel would show if its signal were proportional to time, [row, col]
         expected = composite.rate_dn_per_s * t
         use = usable[k] & (expected > 0.05 * top_dn) & (expected < 0.95 * top_dn)
         if use.sum() >= 20:
@@ -99,6 +102,7 @@ def photon_transfer(
     linear : result of `linearity`.
     """
     range_dn = spec.full_scale_dn - dark.black if saturation is None else saturation
+    # K of each tile position, from signals below 70 % of the range, where the response is straight
     gains = {p: system_gain(b, 0.7 * range_dn) for p, b in bins.items()}
     good = {p: g for p, g in gains.items() if np.isfinite(g[0]) and g[0] > 5 * g[1]}
     if not good:
@@ -108,6 +112,7 @@ def photon_transfer(
     value, error = np.array(list(good.values())).T
     weight = 1 / error**2
     k = float(weight @ value / weight.sum())
+    # positions that differ by more than their errors widen that of the mean
     chi2 = float(weight @ (value - k) ** 2) / max(len(good) - 1, 1)
     k_error = float(np.sqrt(max(chi2, 1.0) / weight.sum()))
     cell = [[gains.get((i, j), (np.nan, np.nan)) for j in range(spec.tile_cols)] for i in range(spec.tile_rows)]
@@ -144,8 +149,10 @@ def _read_noise(fits: dict[tuple[int, int], VarianceFit], k: float, relative: fl
     if not known:
         return not_identifiable("the variance at zero light and zero exposure is not above zero")
     variance = np.array([f.beta[0] for f in known])
+    # in DN², as the variance itself
     error = np.sqrt([f.covariance[0, 0] for f in known])
     noise = float(np.sqrt(variance.mean()))
+    # error of a mean, and of a root: σ(√v) = σ(v)/(2√v)
     noise_error = float(np.sqrt(np.sum(error**2)) / len(known) / (2 * noise))
     result = estimated(noise / k, noise / k * float(np.hypot(noise_error / noise, relative)), "e-")
     return result | {"value_dn": noise}
@@ -168,6 +175,7 @@ def _dark_current(
 def _dsnu(dark: DarkModel, k: float, relative: float) -> dict[str, Any]:
     """Spatial standard deviation of N_FP without row offsets and without the noise of the estimate."""
     values = dark.n_blc[~dark.bad].astype(np.float64)
+    # the spread over pixels holds the noise of each estimate as well
     variance = float(values.var()) - float(dark.covariance[0, 0])
     if variance <= 0:
         return not_identifiable("the fixed pattern is below the noise of its estimate; capture more dark frames")
@@ -190,6 +198,7 @@ def _prnu(composite: Composite, dark: DarkModel, spec: CaptureSpec) -> dict[str,
             if rate.size > 100 and rate.mean() > 0:
                 noise = float(np.mean(composite.standard_error_dn_per_s[cut][use].astype(np.float64) ** 2))
                 parts.append((rate.var() / rate.mean() ** 2, noise / rate.mean() ** 2, rate.size))
+    # a picture of something would count as non-uniformity: each position must be nearly uniform
     flat = parts and all(np.sqrt(total) < _FLAT_SPREAD for total, _, _ in parts)
     if not flat:
         return not_identifiable("the lit scene is not a flat field; capture a uniform light to get PRNU")
@@ -197,5 +206,6 @@ def _prnu(composite: Composite, dark: DarkModel, spec: CaptureSpec) -> dict[str,
     if variance <= 0:
         return not_identifiable("the spread over pixels is below the noise of the means; capture more lit frames")
     prnu = 100 * float(np.sqrt(variance))
+    # a variance over n pixels is off by √(2/n) of itself; the positions are averaged
     scatter = float(np.sqrt(np.sum([2 * total**2 / size for total, _, size in parts]))) / len(parts)
     return estimated(prnu, 100 * scatter / (2 * np.sqrt(variance)), "%") | {"note": "shading of the light is included"}

@@ -15,6 +15,8 @@ from hesim_render.calibrate.moments import FrameMoments
 _INDIVIDUAL = 5.0
 #: Box that separates shading from pixels, px.
 _BOX = 15
+#: Number of robust standard deviations from which a pixel is an outlier.
+_OUTLYING = 8.0
 #: The light's shading varies over more than this part of the picture; finer structure is the sensor's.
 _SHADING_PART = 1 / 24
 #: Chance that the noise of a profile makes a peak in its spectrum that counts as a pattern.
@@ -273,9 +275,9 @@ def _profile(values: NDArray, noise: float, law: float = 0.5) -> NDArray[np.floa
     return np.asarray(np.fft.irfft(spectrum * part**law, values.size))
 
 
-def outliers(image: NDArray, noise: tuple[float, float, float], sigmas: float = 8.0) -> NDArray[np.bool_]:
+def outliers(image: NDArray, noise: tuple[float, float, float]) -> NDArray[np.bool_]:
     """Pixels [row, col] that lie so many robust standard deviations from the pixels around them."""
     rest, spread = _without_profiles(image)
     spread = max(spread, float(np.sqrt(max(noise[2], 0.0))), 1e-12)
     rest -= uniform_filter(np.clip(rest, -_INDIVIDUAL * spread, _INDIVIDUAL * spread), _BOX, mode="nearest")
-    return np.abs(rest) > sigmas * spread
+    return np.abs(rest) > _OUTLYING * spread

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from hesim_render.calibrate.asynchronous.checks import TrialGoodness, check_trials
 from hesim_render.calibrate.asynchronous.defects import TrialDefects, classify, plainly_bad, unlike
 from hesim_render.calibrate.asynchronous.fit import MOST_PIXELS, Fit, fit_trials, rough_start
-from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, NAMES, THETA, Law, TrialCounts, log_prior
+from hesim_render.calibrate.asynchronous.likelihood import NAMES, THETA, Law, TrialCounts
 from hesim_render.calibrate.asynchronous.trials import Trials, read_trials
 from hesim_render.calibrate.estimate import Finding, Spread
 from hesim_render.core.errors import SpecError
@@ -141,15 +140,12 @@ def _pixel_thresholds(
     """Posterior mean and standard deviation of each pixel's threshold given its counts, over the mean threshold."""
     k = 0 if polarity > 0 else 1
     grid = fit.likelihood.grids[k]
-    prior = log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid)
     relative = grid / fit.values[THETA[k]]
     count = steps.calm.shape[1]
     mean, spread = np.ones((2, count), np.float32)
     for begin in range(0, count, _CHUNK):
         some = np.arange(begin, min(begin + _CHUNK, count))
-        counts = TrialCounts.of((steady.of(some), steps.of(some)), polarity)
-        log = counts.log_likelihood(fit.values, grid, fit.law) + prior
-        weight = np.exp(log - logsumexp(log, axis=1, keepdims=True))
+        weight = fit.law_given(TrialCounts.of((steady.of(some), steps.of(some)), polarity))
         mean[some] = weight @ relative
         spread[some] = np.sqrt(np.maximum(weight @ relative**2 - mean[some].astype(np.float64) ** 2, 0.0))
     return mean, spread

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 from scipy.stats import f as f_law
 from scipy.stats import norm, poisson
 
 from hesim_render.calibrate.asynchronous.fit import Fit, median_and_spread, pixel_thresholds
-from hesim_render.calibrate.asynchronous.likelihood import LEAK, MISMATCH, THETA, chances, log_prior, step_of
+from hesim_render.calibrate.asynchronous.likelihood import LEAK, THETA, chances, step_of
 from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.calibrate.estimate import ALARM, Finding
 
@@ -69,10 +68,8 @@ def _columns(fit: Fit) -> Columns:
     parts: list[tuple[NDArray, NDArray, NDArray, NDArray]] = []
     for k, counts in enumerate(fit.likelihood.counts):
         grid = fit.likelihood.grids[k]
-        log = counts.log_likelihood(fit.values, grid, fit.law)
-        log += log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid)
         # mean over each pixel's possible thresholds: pixels with low thresholds are calm less often, and count less
-        weight = np.exp(log - logsumexp(log, axis=1, keepdims=True))
+        weight = fit.law_given(counts)
         at = at_kind = 0
         for trials in counts.sets:
             chance = chances(fit.values, trials, counts.polarity, grid, fit.law)

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 from scipy.stats import poisson
 
 from hesim_render.calibrate.asynchronous.fit import Fit
-from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, THETA, TrialCounts, chances, log_prior
+from hesim_render.calibrate.asynchronous.likelihood import TrialCounts, chances
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
 from hesim_render.calibrate.flicker import dynamics, unsteady
 from hesim_render.calibration.rates import rate_hz
@@ -53,11 +52,13 @@ def plainly_bad(steady: Trials, steps: Trials) -> NDArray[np.bool_]:
     """Pixels [pixel] that lack a polarity, are never calm, or have events of their own in the brightest light."""
     bad = (steps.on.sum(axis=(0, 1)) == 0) | (steps.off.sum(axis=(0, 1)) == 0)
     for trials in (steady, steps):
+        # a pixel that is hardly ever calm in the brightest light fires by itself
         bright = trials.signal_dn == trials.signal_dn.max()
         most = trials.calm[bright].max(axis=1).sum()
         bad |= trials.calm[bright].sum(axis=0) < _CALM * most
     k = int(np.argmax(steady.signal_dn))
     for events in (n[k].sum(axis=0, dtype=np.float64) for n in (steady.on, steady.off)):
+        # the mean of what good pixels give, which the few hot ones do not raise
         usual = np.minimum(events, np.quantile(events, 0.99) + 1).mean()
         bad |= poisson.sf(events - 1, max(usual, 1.0 / events.size)) < _CHANCE
     return bad
@@ -75,6 +76,7 @@ def unlike(fit: Fit, steady: Trials, steps: Trials, good: NDArray[np.bool_]) -> 
         some = pixels[begin : begin + _CHUNK]
         for k, polarity in enumerate((1, -1)):
             result[3 * k : 3 * k + 3, some] = _tests(fit, steady.of(some), steps.of(some), polarity)
+    # a test that so many pixels fail is a fault of the model, not of the pixels
     wrong = result[result.sum(axis=1) <= _MOST_BAD * pixels.size]
     return np.any(wrong, axis=0) if wrong.size else np.zeros(good.size, bool)
 
@@ -84,20 +86,20 @@ def _tests(fit: Fit, steady: Trials, steps: Trials, polarity: int) -> NDArray[np
     k = 0 if polarity > 0 else 1
     grid = fit.likelihood.grids[k]
     counts = TrialCounts.of([steps], polarity)
-    log = counts.log_likelihood(fit.values, grid, fit.law)
-    log += log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid)
-    weight = np.exp(log - logsumexp(log, axis=1, keepdims=True))
+    # what the S-curve of each pixel leaves of the grid of thresholds, [pixel, threshold]
+    weight = fit.law_given(counts)
     chance = chances(fit.values, counts.sets[0], polarity, grid, fit.law).sum(axis=1)  # [kind, threshold]
-    events = counts.events.reshape(log.shape[0], chance.shape[0], -1).sum(axis=2)
+    events = counts.events.reshape(weight.shape[0], chance.shape[0], -1).sum(axis=2)
     trials = events + counts.silent
     sure, never = chance > 1 - _SURE, chance < _SURE
     quiet = TrialCounts.of([steady], polarity)
     seen = quiet.events.sum(axis=1, keepdims=True)
     usual = chances(fit.values, quiet.sets[0], polarity, grid, fit.law).sum(axis=1)
     bins = len(steady.edges_s) - 1
-    own = quiet.events.reshape(log.shape[0], -1, bins).sum(axis=2) + quiet.silent
+    own = quiet.events.reshape(weight.shape[0], -1, bins).sum(axis=2) + quiet.silent
+    # counts of each test, and their means for every threshold of the grid
     tests = (
-        (np.broadcast_to(seen, log.shape), own @ usual),
+        (np.broadcast_to(seen, weight.shape), own @ usual),
         (counts.silent @ sure, trials @ (sure * (1 - chance))),
         (events @ never, trials @ (never * chance)),
     )
@@ -191,6 +193,7 @@ def _own_rates(steady: Trials, light: int, never_calm: NDArray[np.bool_], most: 
     """
     calm = steady.calm[light].astype(np.float64)
     events = np.stack([n[light].sum(axis=0, dtype=np.float64) for n in (steady.on, steady.off)])
+    # a Poisson process leaves the share exp(−rate · time) of the trials without an event
     silent = np.maximum(calm - events.sum(axis=0), 0.5)
     total = np.log(np.maximum(calm, 0.5) / silent) / steady.edges_s[-1]
     total = np.where(never_calm, -np.log(np.maximum(calm, 0.5) / most) / steady.settle_s, np.maximum(total, 0))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.special import logsumexp
 
 from hesim_render.calibrate.asynchronous.likelihood import (
     CUTOFF,
@@ -24,6 +25,8 @@ from hesim_render.calibrate.asynchronous.likelihood import (
     THETA,
     Law,
     Likelihood,
+    TrialCounts,
+    log_prior,
     threshold_grid,
 )  # fmt: skip
 from hesim_render.calibrate.asynchronous.trials import Trials
@@ -65,6 +68,18 @@ class Fit:
     free: NDArray[np.bool_]
     likelihood: Likelihood
     log_likelihood: float
+
+    def law_of_thresholds(self, k: int) -> NDArray[np.float64]:
+        """Chance of each threshold of the grid of polarity number `k`, over all pixels, [threshold]."""
+        return np.exp(log_prior(self.values[THETA[k]], self.values[MISMATCH[k]], self.likelihood.grids[k]))
+
+    def law_given(self, counts: TrialCounts) -> NDArray[np.float64]:
+        """Chance of each threshold of the grid for each pixel, given its counts, [pixel, threshold]."""
+        k = 0 if counts.polarity > 0 else 1
+        grid = self.likelihood.grids[k]
+        log = counts.log_likelihood(self.values, grid, self.law)
+        log += log_prior(self.values[THETA[k]], self.values[MISMATCH[k]], grid)
+        return np.exp(log - logsumexp(log, axis=1, keepdims=True))
 
     def value(self, name: str) -> float:
         return float(self.values[NAMES.index(name)])

@@ -12,13 +12,10 @@ from hesim_render.calibrate.asynchronous.fit import Fit
 from hesim_render.calibrate.asynchronous.likelihood import (
     DARK,
     LEAK,
-    MISMATCH,
     NAMES,
     RESPONSE,
     SHOT,
-    THETA,
     chances,
-    log_prior,
     noise_of,
     step_of,
 )  # fmt: skip
@@ -138,8 +135,7 @@ def _figures(fit: Fit, steady: Trials, steps: Trials) -> dict[str, NDArray]:
     """
     rows, rates = [], [np.array(steady.signal_dn)]
     for k, polarity in enumerate((1, -1)):
-        grid = fit.likelihood.grids[k]
-        weight = np.exp(log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid))
+        grid, weight = fit.likelihood.grids[k], fit.law_of_thresholds(k)
         there = steps.towards(polarity)
         mean = np.cumsum(chances(fit.values, there, polarity, grid, fit.law) @ weight, axis=1)
         trials = there.calm.sum(axis=1, dtype=np.float64)
@@ -158,8 +154,7 @@ def _figures(fit: Fit, steady: Trials, steps: Trials) -> dict[str, NDArray]:
     duration = steady.calm.sum(axis=1, dtype=np.float64) * steady.edges_s[-1]
     rates.append(duration)
     for k, polarity in enumerate((1, -1)):
-        grid = fit.likelihood.grids[k]
-        weight = np.exp(log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid))
+        grid, weight = fit.likelihood.grids[k], fit.law_of_thresholds(k)
         mean = chances(fit.values, steady, polarity, grid, fit.law).sum(axis=1) @ weight
         rates.append(mean / steady.edges_s[-1])
     return {"figure_s_curves": np.concatenate(rows), "figure_noise_rate": np.stack(rates, axis=1)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +84,7 @@ def analyse(
     """
     tell = progress or (lambda what, fraction: None)
     theta_v = captures.spec.theta_hardware_v or 1.0
+    # pixels that no threshold explains would outweigh the others by their counts
     bad = bad_event_pixels(static)
     good = ~bad
     if good.mean() < 0.5:
@@ -91,48 +93,25 @@ def analyse(
         )
     _check_brightness(static, good, captures)
     tell("fitting", 0.2)
-    typical = Typical.of(static, good)
-    begun = {law: best_start(typical.cells, theta_v, law) for law in _LAWS}
-    starts = {law: parameters for law, (parameters, _, _) in begun.items()}
-    # start from the law that is nearer to the medians: means of widely spread counts have less information
-    lead = (begun["sqrt"][1] - begun["linear"][1]) / min(begun["sqrt"][2], begun["linear"][2])
-    by_medians: Law = "sqrt" if lead > DECISIVE else "linear"
-    wanted = (by_medians,) if abs(lead) > _BEYOND_DOUBT else _LAWS
+    begun = _Begun.of(static, good, theta_v)
     pixels = pool_events(static, good, PixelThresholds.unknown(good.shape, 0.0))
-    laws = {law: fit_events(pixels, theta_v, law, starts[law]) for law in wanted}
-    steps, thresholds, reason = None, None, "no contrast steps (evs_steps.npz) were captured"
+    laws = {law: fit_events(pixels, theta_v, law, begun.starts[law]) for law in begun.wanted}
+    steps = None
     if captures.has("evs_steps"):
         tell("contrast steps", 0.3)
-        steps = read_steps(captures, good)
-        result, _ = _measured_thresholds(captures, steps, laws[_likelier(laws)], good)
-        more = np.zeros(good.shape, bool) if result is None else bad_in_steps(steps, result, good)
-        if more.any():
-            bad, good = bad | more, good & ~more
-            steps = read_steps(captures, good)
+        steps, bad = _steps_and_bad(captures, laws[_likelier(laws)], bad)
+        good = ~bad
     tell("fitting", 0.4)
-    alone: Spread | None = None
-    # the fit needs the thresholds, and the contrast in volts needs the fit
-    for turn in range(1 if steps is None else 3):
-        if steps is not None:
-            thresholds, reason = _measured_thresholds(captures, steps, laws[_likelier(laws)], good)
-        if thresholds is not None:
-            spread, known = thresholds.spread, thresholds.of_pixels()
-        else:
-            plain = pool_events(static, good, PixelThresholds.unknown(good.shape, 0.0))
-            alone = alone or static_mismatch(plain, typical)
-            spread, known = alone, PixelThresholds.unknown(good.shape, alone.value)
-        pixels = pool_events(static, good, known)
-        if turn < 2:
-            laws = {law: fit_events(pixels, theta_v, law, starts[law]) for law in wanted}
-        else:
-            law = _likelier(laws)
-            laws[law] = fit_events(pixels, theta_v, law, laws[law].whole * _SYMMETRIC)
-    law = by_medians if thresholds is None and spread.value > 0 else _likelier(laws)
+    laws, pixels, state = _with_thresholds(captures, static, good, steps, begun, laws)
+    spread, known, thresholds = state.spread, state.known, state.measured
+    # means of widely spread counts tell the two laws apart less well than medians do
+    law = begun.law if thresholds is None and spread.value > 0 else _likelier(laws)
     fit, others = laws[law], [other for name, other in laws.items() if name != law]
-    advantage = _advantage(fit, others[0]) if others else abs(lead)
+    advantage = _advantage(fit, others[0]) if others else abs(begun.lead)
     _check_fit(fit, captures)
     best = with_mismatch_error(fit, pixels, theta_v, spread.relative_error)
     tell("fitting positions", 0.6)
+    # each tile position by itself, from the parameters of all together
     fits = [
         fit_events(pool_events(static, good, known, k), theta_v, law, best.parameters, best.free)
         for k in range(static.tile[0] * static.tile[1])
@@ -142,6 +121,7 @@ def analyse(
     if thresholds is not None:
         best, *fits = (_with_sampling_error(fit, thresholds, good) for fit in (best, *fits))
     tell("200 starts", 0.8)
+    # many searches from random starts must end where this one did
     averaged = pool_events(static, good, PixelThresholds.unknown(good.shape, spread.value))
     ends = multi_start(averaged if thresholds is None else pixels, best, theta_v, seed)
     return EvsCalibration(
@@ -157,9 +137,100 @@ def analyse(
         mismatch=spread,
         thresholds=thresholds,
         steps=steps,
-        thresholds_reason=reason,
+        thresholds_reason=state.reason,
         ends=ends,
     )
+
+
+class _Begun(NamedTuple):
+    """A fit to medians of the counts, which bad pixels hardly affect: it starts all later ones.
+
+    Parameters
+    ----------
+    typical : the medians.
+    starts : parameters of either shot law.
+    lead : ln L of the sqrt law less that of the linear one, in units of the scatter of the counts.
+    theta_v : Θ, threshold in V.
+    """
+
+    typical: Typical
+    starts: dict[Law, NDArray[np.float64]]
+    lead: float
+    theta_v: float
+
+    @classmethod
+    def of(cls, static: StaticCapture, good: NDArray[np.bool_], theta_v: float) -> _Begun:
+        typical = Typical.of(static, good)
+        begun = {law: best_start(typical.cells, theta_v, law) for law in _LAWS}
+        lead = (begun["sqrt"][1] - begun["linear"][1]) / min(begun["sqrt"][2], begun["linear"][2])
+        return cls(typical, {law: parameters for law, (parameters, _, _) in begun.items()}, lead, theta_v)
+
+    @property
+    def law(self) -> Law:
+        """The law that is nearer to the medians."""
+        return "sqrt" if self.lead > DECISIVE else "linear"
+
+    @property
+    def wanted(self) -> tuple[Law, ...]:
+        """The laws that are fitted: one where the medians leave no doubt."""
+        return (self.law,) if abs(self.lead) > _BEYOND_DOUBT else _LAWS
+
+
+class _KnownThresholds(NamedTuple):
+    """Thresholds of the pixels: measured with steps or, without, their spread alone; and why none are measured."""
+
+    spread: Spread
+    known: PixelThresholds
+    measured: Thresholds | None
+    reason: str
+
+
+def _steps_and_bad(captures: CaptureSet, fit: EventFit, bad: NDArray[np.bool_]) -> tuple[Steps, NDArray[np.bool_]]:
+    """The contrast steps of the good pixels, and the bad pixels, now also those that the steps show."""
+    steps = read_steps(captures, ~bad)
+    result, _ = _measured_thresholds(captures, steps, fit, ~bad)
+    more = np.zeros(bad.shape, bool) if result is None else bad_in_steps(steps, result, ~bad)
+    if not more.any():
+        return steps, bad
+    return read_steps(captures, ~(bad | more)), bad | more
+
+
+def _with_thresholds(
+    captures: CaptureSet,
+    static: StaticCapture,
+    good: NDArray[np.bool_],
+    steps: Steps | None,
+    begun: _Begun,
+    laws: dict[Law, EventFit],
+) -> tuple[dict[Law, EventFit], PixelCounts, _KnownThresholds]:
+    """Fits with the thresholds of the pixels, these thresholds, and the counts in cells of like threshold.
+
+    The fit needs the thresholds, and the contrast in volts needs the fit: with steps, both are found in turns.
+    """
+    alone: _KnownThresholds | None = None
+    for turn in range(1 if steps is None else 3):
+        thresholds, reason = None, "no contrast steps (evs_steps.npz) were captured"
+        if steps is not None:
+            thresholds, reason = _measured_thresholds(captures, steps, laws[_likelier(laws)], good)
+        if thresholds is not None:
+            state = _KnownThresholds(thresholds.spread, thresholds.of_pixels(), thresholds, reason)
+        else:
+            alone = alone or _of_counts(static, good, begun)
+            state = alone._replace(reason=reason)
+        pixels = pool_events(static, good, state.known)
+        if turn < 2:
+            laws = {law: fit_events(pixels, begun.theta_v, law, begun.starts[law]) for law in begun.wanted}
+        else:
+            law = _likelier(laws)
+            laws[law] = fit_events(pixels, begun.theta_v, law, laws[law].whole * _SYMMETRIC)
+    return laws, pixels, state
+
+
+def _of_counts(static: StaticCapture, good: NDArray[np.bool_], begun: _Begun) -> _KnownThresholds:
+    """The spread of thresholds that the scatter of counts over pixels shows."""
+    plain = pool_events(static, good, PixelThresholds.unknown(good.shape, 0.0))
+    spread = static_mismatch(plain, begun.typical)
+    return _KnownThresholds(spread, PixelThresholds.unknown(good.shape, spread.value), None, "")
 
 
 def _measured_thresholds(
@@ -251,6 +322,7 @@ def step_in_ln(captures: CaptureSet, steps: Steps, fit: EventFit) -> NDArray[np.
         return steps.contrast
     if not (fit.identified("A") and fit.identified("B")):
         return None
+    # the same change of the signal as one of the voltage, whose offset makes it smaller
     k = coefficients(from_natural(fit.values))
     return np.log(voltage(k, steps.signal_dn * np.exp(steps.contrast)) / voltage(k, steps.signal_dn))
 
@@ -268,6 +340,7 @@ def bootstrap_errors(result: EvsCalibration, samples: int, seed: int) -> NDArray
     good, fit = ~result.bad, result.together
     values = []
     for _ in range(samples):
+        # a Poisson number of copies of each pixel is a resampling of all
         weight = rng.poisson(1.0, good.shape)
         pixels = pool_events(result.static, good & (weight > 0), result.known, None, weight)
         values.append(fit_events(pixels, result.theta_v, fit.law, fit.parameters, fit.free).values[:4])

@@ -69,6 +69,7 @@ class Cells:
         """At most `most` cells of each polarity, by pooling neighbours in brightness. For searches, not for results."""
         order = np.lexsort((self.signal_dn, self.polarity))
         pixels = self.pixels[order]
+        # neighbours in brightness get one number, for each polarity apart
         rank = np.concatenate(
             [np.arange(n) * min(most / n, 1.0) for n in np.unique(self.polarity, return_counts=True)[1]]
         )
@@ -79,6 +80,7 @@ class Cells:
             return np.bincount(group, values[order] * pixels) / np.maximum(total, 1e-30)
 
         relative = mean(self.relative)
+        # within and between the pooled cells
         spread = np.sqrt(np.maximum(mean(self.spread**2 + self.relative**2) - relative**2, 0.0))
         events = np.bincount(group, self.events[order]).astype(np.float64)
         return Cells(mean(self.signal_dn), mean(self.polarity), relative, spread, total, events, self.trials)
@@ -169,6 +171,7 @@ def pool_events(
     position : number of the tile position whose pixels are used; None for all.
     weight : [row, col], number of times that a pixel counts (bootstrap).
     """
+    # bins of all good pixels, so that cells do not depend on the chosen position
     edges = brightness_edges(static.signal_dn[good])
     take = good if position is None else good & (static.position == position)
     signal = static.signal_dn[take]
@@ -183,6 +186,7 @@ def pool_events(
             strict=True,
         ):  # fmt: skip
             x, r, left, n = light[take], relative[take], spread[take], events[take].astype(np.float64)
+            # a cell has pixels of one bin of brightness, whose thresholds are alike; the dark has no bins
             alike = np.rint(r / _THRESHOLD_STEP).astype(np.intp)
             alike -= alike.min(initial=0)
             key = alike if session else bright * (alike.max(initial=0) + 1) + alike
@@ -193,6 +197,7 @@ def pool_events(
             def mean(values: NDArray, cell: NDArray = cell, least: NDArray = least) -> NDArray[np.float64]:
                 return np.bincount(cell, values if weights is None else values * weights) / least
 
+            # mean threshold of each cell, and what is left of the spread about it
             centre = mean(r)
             within = np.sqrt(mean(left * left + (r - centre[cell]) ** 2))
             values = mean(x), np.full(pixels.size, polarity), centre, within, pixels, mean(n) * least

@@ -76,6 +76,7 @@ def read_static(captures: CaptureSet, calibration: str | Path | None = None) -> 
     if signal.ndim != 2 or signal.dtype.kind not in "uif" or signal.size == 0:
         raise SpecError(f"signal_dn has shape {signal.shape}; expected numbers [row, col]", file=file)
     trials = int(single_number(data["n_trials"], "n_trials", file, whole=True, least=1))
+    # counts are whole, within the trials, and of the size of the signal; a trial gives one event at most
     names = [name for name in ("n_on", "n_off", "dark_n_on", "dark_n_off") if name in data]
     if len(names) == 3:
         raise SpecError("dark_n_on and dark_n_off are given together or not at all", file=file)
@@ -92,6 +93,7 @@ def read_static(captures: CaptureSet, calibration: str | Path | None = None) -> 
         if first in maps and (maps[first] + maps[second]).max() > trials:
             raise SpecError(f"{first} and {second} hold more events together than n_trials = {trials}", file=file)
     total = sum(int(counts.sum()) for counts in maps.values())
+    # neither no event nor an event in every trial tells how wide the noise is
     if total == 0:
         raise SpecError("holds no event at all; capture more trials, or lower the threshold", file=file)
     if total > 0.98 * trials * signal.size * len(names) / 2:

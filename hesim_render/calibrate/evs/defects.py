@@ -78,6 +78,7 @@ def bad_event_pixels(static: StaticCapture) -> NDArray[np.bool_]:
 
 
 def _out_of_reach(counts: NDArray, group: NDArray, trials: int, u: NDArray, reach: float) -> NDArray[np.bool_]:
+    # chances of an event with the lowest and the highest threshold that may be, [group]
     high, low = ndtr(-u * max(1 - reach, 0.0)), ndtr(-u * (1 + reach))
     # Only counts far off need the exact tail.
     margin = 4.0
@@ -93,6 +94,7 @@ def _apart(both: list[NDArray], group: NDArray, trials: int, middle: list[NDArra
     """Pixels whose ON and OFF thresholds differ by more than those of the other pixels."""
     result = np.zeros(group.shape, bool)
     enough = np.all([counts >= LEAST_EVENTS for counts in both], axis=0)
+    # threshold over noise from the rate of each pixel, and its variance by counting, for either polarity
     rate = [(counts[enough] + 0.5) / (trials + 1) for counts in both]
     t = [-ndtri(r) for r in rate]
     noise = sum(r * (1 - r) / trials / np.maximum(density(x), 1e-12) ** 2 for r, x in zip(rate, t, strict=True))
@@ -102,6 +104,7 @@ def _apart(both: list[NDArray], group: NDArray, trials: int, middle: list[NDArra
         return result
     difference = (t[0] - t[1] - (middle[0] - middle[1])[group[enough]])[usable] / u[usable]
     own = np.sqrt(noise[usable]) / u[usable]
+    # how far the two thresholds of good pixels differ: the quartile-like spread, less what counting makes
     low, centre, high = np.quantile(difference, [0.16, 0.5, 0.84])
     spread = np.sqrt(max(((high - low) / 2) ** 2 - float(np.median(own**2)), 0.0))
     limit = max(_LEAST_REACH, _SPREADS * spread) + _SIGMAS * own
@@ -141,6 +144,7 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     silent = np.ones(int(bad.sum()), bool)
     own, excess, significant = [], [], []
     for signal, on, off in static.sessions:
+        # counts of the bad pixels against those of good pixels in the same light, [polarity, pixel]
         both = np.stack([on[bad], off[bad]]).astype(np.float64)
         usual, most = _of_like(signal, bad, (on, off), static.trials)
         beyond = both > most + _SIGMAS * np.sqrt(most + 1)
@@ -186,6 +190,7 @@ def _of_like(
     -------
     mean, limit : [polarity, pixel], mean probability of ON and of OFF, and the count that only a thousandth exceed.
     """
+    # groups of good pixels of like brightness, in order; each bad pixel takes the group of its own
     good = ~bad & np.isfinite(signal)
     group = like_brightness(signal[good])
     light = np.array([part.max() for part in by_group(signal[good], group)])

@@ -33,88 +33,119 @@ _MODEL = (
 
 def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | None) -> dict[str, Any]:
     """The section ``evs``; a parameter that the data do not determine is null, with the reason."""
-    fit, spread, thresholds = result.together, result.dispersion, result.thresholds
-    other = "sqrt" if fit.law == "linear" else "linear"
-    tile = result.static.tile
-    theta = not_identifiable(result.thresholds_reason)
+    fit, tile = result.together, result.static.tile
     findings, levels = check_events(result, captures.spec.contrast_of)
     section: dict[str, Any] = {
         "findings": [finding.described() for finding in findings],
         "model": _MODEL,
         "theta_hardware_v": captures.spec.theta_hardware_v
         or not_identifiable("not stated in capture.yaml; 1 V is taken as its unit"),
-        "shot_law": fit.law,
-        "shot_law_log_likelihood": {
-            fit.law: fit.log_likelihood,
-            other: fit.log_likelihood - result.advantage,
-            "decisive": bool(abs(result.advantage) > DECISIVE and fit.identified("C")),
-        },
+        **_shot_law(result),
         **_parameters(fit),
         "positions": [
             {"tile_position": list(divmod(k, tile[1])), **_parameters(one)} for k, one in enumerate(result.fits)
         ],
         **_gauge(result),
+        **_thresholds(result),
     }
-    if thresholds is None:
-        section |= {"theta": theta, "theta_on": theta, "theta_off": theta}
-    else:
-        error = np.sqrt(np.diag(thresholds.covariance))
-        section |= {
-            "theta": estimated(thresholds.theta, thresholds.theta_error, "ln", GROUPS),
-            "theta_on": estimated(thresholds.theta_on, error[0], "ln", GROUPS),
-            "theta_off": estimated(thresholds.theta_off, error[1], "ln", GROUPS),
-        }
     if levels is not None:
         section["s_curve"] = {
             name: estimated(value, error, "events per trial", GROUPS) for name, (value, error) in vars(levels).items()
         }
     section["threshold_mismatch_rel"] = result.mismatch.described() | {
-        "from": "static counts" if thresholds is None else "steps"
+        "from": "static counts" if result.thresholds is None else "steps"
     }
-    rho, leak = fit.values[4:]
-    error = np.sqrt(np.maximum(np.diag(fit.covariance), 0))
-    absent = "not significant (likelihood ratio at 1e-3): the model without it is kept"
-    section["asymmetry"] = estimated(rho, error[4]) if fit.free[4] else {"value": 0.0, "note": absent}
-    leaks = fit.free[5]
-    section["leak_per_trial"] = estimated(leak, error[5], "ON events") if leaks else {"value": 0.0, "note": absent}
-    interval_s = captures.interval_s
-    if interval_s is not None:
-        rate = float(rate_hz(leak, interval_s)), error[5] / (1 - leak) / interval_s
-        section["tick_us"] = interval_s * US_PER_S
-        section["leak_rate_hz"] = estimated(*rate, "Hz") if leaks else {"value": 0.0, "note": absent}
-    reason = "hidden behind the mismatch of thresholds, or too few events"
-    section["dispersion"] = {
-        name: estimated(value, error) if np.isfinite(value) else not_identifiable(reason)
-        for name, value, error in (
-            ("temporal", spread.total, spread.total_error),
-            ("temporal_difference", spread.difference, spread.difference_error),
-        )
-    }
-    section["dispersion"]["standard_errors"] = "sandwich"
-    section["dispersion"]["design_effect"] = fit.design_effect
-    section["goodness"] = {
-        "chi2_per_dof": fit.goodness.per_dof,
-        "dof": fit.goodness.dof,
-        "p_value": fit.goodness.p_value,
-        "positions_chi2_per_dof": [one.goodness.per_dof for one in result.fits],
-        "positions_p_value": [one.goodness.p_value for one in result.fits],
-    }
-    section["signal_range_dn"] = [float(np.nanmin(result.static.signal_dn)), float(np.nanmax(result.static.signal_dn))]
-    section["trials"] = result.static.trials
-    section["bad_pixels"] = int(result.bad.sum())
-    section["defects"] = {kind.name.lower(): result.defects.count(kind) for kind in Defect if kind is not Defect.NONE}
-    describes = result.ends.describe_counts(fit.goodness.per_dof)
-    scatter = np.ptp(result.ends.values[describes], axis=0) / result.ends.standard_error
-    section["multi_start"] = {
-        "starts": describes.size,
-        "lost": int(np.sum(~describes)),
-        "largest_difference_in_standard_errors": [s if ok else None for s, ok in zip(scatter, fit.free, strict=False)],
+    section |= _asymmetry_and_leak(fit, captures.interval_s)
+    section |= {
+        "dispersion": _dispersion(result),
+        "goodness": {
+            "chi2_per_dof": fit.goodness.per_dof,
+            "dof": fit.goodness.dof,
+            "p_value": fit.goodness.p_value,
+            "positions_chi2_per_dof": [one.goodness.per_dof for one in result.fits],
+            "positions_p_value": [one.goodness.p_value for one in result.fits],
+        },
+        "signal_range_dn": [float(np.nanmin(result.static.signal_dn)), float(np.nanmax(result.static.signal_dn))],
+        "trials": result.static.trials,
+        "bad_pixels": int(result.bad.sum()),
+        "defects": {kind.name.lower(): result.defects.count(kind) for kind in Defect if kind is not Defect.NONE},
+        "multi_start": _multi_start(result),
     }
     if bootstrap is not None:
         section["bootstrap_standard_error"] = {
             name: e if ok else None for name, e, ok in zip("ABCD", bootstrap, fit.free, strict=False)
         }
     return section
+
+
+def _shot_law(result: EvsCalibration) -> dict[str, Any]:
+    """The law of the shot noise, and how much likelier it is than the other."""
+    fit = result.together
+    other = "sqrt" if fit.law == "linear" else "linear"
+    return {
+        "shot_law": fit.law,
+        "shot_law_log_likelihood": {
+            fit.law: fit.log_likelihood,
+            other: fit.log_likelihood - result.advantage,
+            "decisive": bool(abs(result.advantage) > DECISIVE and fit.identified("C")),
+        },
+    }
+
+
+def _thresholds(result: EvsCalibration) -> dict[str, Any]:
+    """Contrast thresholds, which need steps of contrast."""
+    thresholds = result.thresholds
+    if thresholds is None:
+        return dict.fromkeys(("theta", "theta_on", "theta_off"), not_identifiable(result.thresholds_reason))
+    error = np.sqrt(np.diag(thresholds.covariance))
+    return {
+        "theta": estimated(thresholds.theta, thresholds.theta_error, "ln", GROUPS),
+        "theta_on": estimated(thresholds.theta_on, error[0], "ln", GROUPS),
+        "theta_off": estimated(thresholds.theta_off, error[1], "ln", GROUPS),
+    }
+
+
+def _asymmetry_and_leak(fit: EventFit, interval_s: float | None) -> dict[str, Any]:
+    """ρ and λ of a fit, 0 where the counts do not need them; the leak per second where the tick is known."""
+    rho, leak = fit.values[4:]
+    error = np.sqrt(np.maximum(np.diag(fit.covariance), 0))
+    absent = {"value": 0.0, "note": "not significant (likelihood ratio at 1e-3): the model without it is kept"}
+    leaks = fit.free[5]
+    section: dict[str, Any] = {
+        "asymmetry": estimated(rho, error[4]) if fit.free[4] else absent,
+        "leak_per_trial": estimated(leak, error[5], "ON events") if leaks else absent,
+    }
+    if interval_s is not None:
+        rate = float(rate_hz(leak, interval_s)), error[5] / (1 - leak) / interval_s
+        section["tick_us"] = interval_s * US_PER_S
+        section["leak_rate_hz"] = estimated(*rate, "Hz") if leaks else absent
+    return section
+
+
+def _dispersion(result: EvsCalibration) -> dict[str, Any]:
+    """Scatter of the counts in time over that of counting, and that over pixels, which widens the errors."""
+    spread = result.dispersion
+    reason = "hidden behind the mismatch of thresholds, or too few events"
+    section: dict[str, Any] = {
+        name: estimated(value, error) if np.isfinite(value) else not_identifiable(reason)
+        for name, value, error in (
+            ("temporal", spread.total, spread.total_error),
+            ("temporal_difference", spread.difference, spread.difference_error),
+        )
+    }
+    return section | {"standard_errors": "sandwich", "design_effect": result.together.design_effect}
+
+
+def _multi_start(result: EvsCalibration) -> dict[str, Any]:
+    """Searches from many starts, and how far apart those that describe the counts end."""
+    fit, ends = result.together, result.ends
+    describes = ends.describe_counts(fit.goodness.per_dof)
+    scatter = np.ptp(ends.values[describes], axis=0) / ends.standard_error
+    return {
+        "starts": describes.size,
+        "lost": int(np.sum(~describes)),
+        "largest_difference_in_standard_errors": [s if ok else None for s, ok in zip(scatter, fit.free, strict=False)],
+    }
 
 
 def _parameters(fit: EventFit) -> dict[str, Any]:

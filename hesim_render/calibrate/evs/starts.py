@@ -42,7 +42,7 @@ class Ends:
         return self.log_likelihood_below < _TOO_UNLIKELY * max(1.0, chi2_per_dof)
 
 
-def multi_start(pixels: PixelCounts, fit: EventFit, theta_v: float, seed: int, starts: int = _STARTS) -> Ends:
+def multi_start(pixels: PixelCounts, fit: EventFit, theta_v: float, seed: int) -> Ends:
     """Maximum likelihood from many starts: A, B, C vary by e² in either direction, D over (−0.9, 0.9).
 
     Parameters
@@ -51,19 +51,18 @@ def multi_start(pixels: PixelCounts, fit: EventFit, theta_v: float, seed: int, s
     fit : the fit whose parameters the starts surround.
     theta_v : Θ, threshold in V.
     seed : seed of the starts.
-    starts : number of starts.
 
     Returns
     -------
     The ends of the searches.
     """
     rng = np.random.default_rng(seed)
-    begin = np.tile(fit.values, (starts, 1))
+    begin = np.tile(fit.values, (_STARTS, 1))
     free = np.array(fit.free)
-    spread = np.where(free[:3], rng.uniform(-2, 2, (starts, 3)), 0)
+    spread = np.where(free[:3], rng.uniform(-2, 2, (_STARTS, 3)), 0)
     begin[:, :3] *= np.exp(spread)
     if free[3]:
-        begin[:, 3] = rng.uniform(-0.9, 0.9, starts)
+        begin[:, 3] = rng.uniform(-0.9, 0.9, _STARTS)
     begin[:, 4:] = np.where(free[4:], 0.0, begin[:, 4:])
     cells = pixels.cells.typical().coarser()
     eta, fisher, _ = search(cells, from_natural(begin), theta_v, fit.law, fit.free)

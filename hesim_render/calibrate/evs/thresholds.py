@@ -227,6 +227,7 @@ def _widths(values: NDArray, step: NDArray) -> NDArray[np.float64]:
 def curve_slopes(values: NDArray, polarity: float, step: NDArray) -> NDArray[np.float64]:
     """Derivatives [step, 4] of `curve`."""
     k, s = (0 if polarity > 0 else 1), _widths(values, step)
+    # P = Q(v): its slopes are minus the normal density times those of v
     v = (values[k] - polarity * step) / s
     density = np.exp(-0.5 * v * v) / np.sqrt(2 * np.pi)
     slopes = np.zeros((step.size, 4))

@@ -61,20 +61,8 @@ def calibrate_recordings(
         If a file cannot be read, has no events, is of another sensor than the first, or is limited by the read-out.
     """
     names = [str(file) for file in files]
-    if not names:
-        raise RangeError("files", names, "a recording of a still scene at least")
-    if lux is not None and len(lux) != len(names):
-        raise RangeError("lux", list(lux), f"one illuminance for each of the {len(names)} recordings")
-    if lux is not None and not all(np.isfinite(level) and level >= 0 for level in lux):
-        raise RangeError("lux", list(lux), "illuminances of 0 or more")
-    if (target_file is None) != (target_contrast is None):
-        raise RangeError(
-            "target_contrast", target_contrast, "the contrast of the target where one is given, and only there"
-        )
-    if target_contrast is not None and not (np.isfinite(target_contrast) and 1 < target_contrast < 1e4):
-        raise RangeError("target_contrast", target_contrast, "bright over dark, from 1 to 10000")
-    if target_hz is not None and (target_file is None or not target_hz > 0):
-        raise RangeError("target_hz", target_hz, "cycles per second of a moving target, above 0")
+    _check_scenes(names, lux)
+    _check_target(target_file is not None, target_contrast, target_hz)
     path = None if out is None else free_place(out, overwrite, (".yaml", ".yml"))
     report = progress or (lambda what, part: None)
     tallies: list[EventTally] = []
@@ -95,6 +83,24 @@ def calibrate_recordings(
         with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8") as file:
             write_yaml(plain(result), file, width=120)
     return result
+
+
+def _check_scenes(names: list[str], lux: Sequence[float] | None) -> None:
+    if not names:
+        raise RangeError("files", names, "a recording of a still scene at least")
+    if lux is not None and len(lux) != len(names):
+        raise RangeError("lux", list(lux), f"one illuminance for each of the {len(names)} recordings")
+    if lux is not None and not all(np.isfinite(level) and level >= 0 for level in lux):
+        raise RangeError("lux", list(lux), "illuminances of 0 or more")
+
+
+def _check_target(is_given: bool, contrast: float | None, cycles_hz: float | None) -> None:
+    if is_given != (contrast is not None):
+        raise RangeError("target_contrast", contrast, "the contrast of the target where one is given, and only there")
+    if contrast is not None and not (np.isfinite(contrast) and 1 < contrast < 1e4):
+        raise RangeError("target_contrast", contrast, "bright over dark, from 1 to 10000")
+    if cycles_hz is not None and not (is_given and cycles_hz > 0):
+        raise RangeError("target_hz", cycles_hz, "cycles per second of a moving target, above 0")
 
 
 def figures(

@@ -7,12 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.calibrate.report import parts
 from hesim_render.calibrate.report.parts import HEAD, findings, headline, p_text, parameter_row
 from hesim_render.core.drawing import COLOURS, legend_below, panel, picture, points, svg
 from hesim_render.core.html import filled, tick_text
-
-#: Mean number of events for which no event is counted with a probability of 5 %: −ln 0.05.
-_UPPER_OF_NONE = 3.0
 
 
 def asynchronous_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
@@ -57,23 +55,16 @@ def _noise_rate(maps: dict[str, NDArray]) -> str:
     signal, on, off, seconds, fit_on, fit_off = rows.T
     lit = signal > 0
     darkest = float(signal[lit].min()) if lit.any() else 0.1
-    lowest = float(np.concatenate([np.where(n > 0, n, _UPPER_OF_NONE) / seconds for n in (on, off)]).min())
     figure, axes = panel("Events in steady light", "light signal, DN", "events per s and pixel")
-    # a logarithmic axis with the dark on it
-    axes.set_xscale("symlog", linthresh=10 ** np.floor(np.log10(darkest)), linscale=0.5)
+    parts.scale_from_dark(axes, darkest)
     axes.set_yscale("log")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(tick_text)
         axis.set_minor_formatter("")
     for events, fit, colour, label in ((on, fit_on, COLOURS[1], "ON"), (off, fit_off, COLOURS[0], "OFF")):
-        some = events > 0
-        points(axes, signal[some], events[some] / seconds[some], colour, label)
-        axes.plot(
-            signal[~some], _UPPER_OF_NONE / seconds[~some], color=colour, linestyle="none", marker=11, alpha=0.7,
-            label=f"_{label} none counted",
-        )  # fmt: skip
+        parts.counted(axes, signal, events, seconds, colour, label)
         axes.plot(signal, fit, color=colour)
-    axes.set_ylim(bottom=0.5 * lowest)
+    axes.set_ylim(bottom=0.5 * min(parts.lowest(on, seconds), parts.lowest(off, seconds)))
     legend_below(figure, axes, 2)
     return svg(figure)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.calibrate.report import parts
 from hesim_render.calibrate.report.parts import HEAD, findings, headline, p_text, parameter_row
 from hesim_render.core.drawing import COLOURS, legend_below, panel, picture, points, svg
 from hesim_render.core.html import filled, tick_text
@@ -14,9 +15,6 @@ from hesim_render.core.html import filled, tick_text
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-#: Mean number of events for which no event is counted with a probability of 5 %: −ln 0.05.
-_UPPER_OF_NONE = 3.0
 
 
 def evs_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
@@ -52,7 +50,7 @@ def _rate_panel(title: str, signal: NDArray) -> tuple[Figure, Axes]:
     figure, axes = panel(title, "light signal, DN", "P per trial")
     darkest_lit = float(signal[signal > 0].min(initial=np.inf))
     if float(signal.max()) > 100 * darkest_lit:
-        axes.set_xscale("symlog", linthresh=10 ** np.floor(np.log10(darkest_lit)), linscale=0.5)
+        parts.scale_from_dark(axes, darkest_lit)
         axes.xaxis.set_major_formatter(tick_text)
     axes.set_yscale("log", subs=range(2, 10))
     axes.yaxis.set_major_formatter(tick_text)
@@ -76,12 +74,12 @@ def _rates(maps: dict[str, NDArray]) -> str:
     signal, on, off, trials = maps["figure_rates"].T
     line, fit_on, fit_off = maps["figure_rates_fit"].T
     figure, axes = _rate_panel("Event probability against brightness", signal)
-    _counted(axes, signal, on, trials, COLOURS[1], "ON")
-    _counted(axes, signal, off, trials, COLOURS[0], "OFF")
+    parts.counted(axes, signal, on, trials, COLOURS[1], "ON")
+    parts.counted(axes, signal, off, trials, COLOURS[0], "OFF")
     axes.plot(line, fit_on, color=COLOURS[1])
     axes.plot(line, fit_off, color=COLOURS[0], linestyle="--")
-    counted = _lowest(np.concatenate([on, off]), np.concatenate([trials, trials]))
-    _end_of_axis(axes, counted, min(fit_on.min(), fit_off.min()))
+    least = parts.lowest(np.concatenate([on, off]), np.concatenate([trials, trials]))
+    _end_of_axis(axes, least, min(fit_on.min(), fit_off.min()))
     legend_below(figure, axes, 2)
     return svg(figure)
 
@@ -93,29 +91,10 @@ def _position_rates(maps: dict[str, NDArray]) -> str:
     line = maps["figure_rates_fit"][:, 0]
     for k, fit in enumerate(fits):
         colour, some = COLOURS[k % len(COLOURS)], np.flatnonzero(position == k)[::3]
-        _counted(axes, signal[some], (on + off)[some], 2 * trials[some], colour, size=2.4)
+        parts.counted(axes, signal[some], (on + off)[some], 2 * trials[some], colour, size=2.4)
         axes.plot(line, fit, color=colour)
-    _end_of_axis(axes, _lowest(on + off, 2 * trials), fits.min())
+    _end_of_axis(axes, parts.lowest(on + off, 2 * trials), fits.min())
     return svg(figure)
-
-
-def _counted(
-    axes: Axes, x: NDArray, events: NDArray, trials: NDArray, colour: str, label: str = "", size: float = 3.4
-) -> None:
-    """Rates as points. Where nothing was counted, a triangle points down from the 95 % limit: a logarithmic axis has no
-    0.
-    """
-    some = events > 0
-    points(axes, x[some], events[some] / trials[some], colour, label, size)
-    axes.plot(
-        x[~some], _UPPER_OF_NONE / trials[~some], color=colour, linestyle="none", marker=11, alpha=0.7,
-        label=f"_{label} none counted",
-    )  # fmt: skip
-
-
-def _lowest(events: NDArray, trials: NDArray) -> float:
-    """Lowest value that `_counted` draws."""
-    return float((np.where(events > 0, events, _UPPER_OF_NONE) / trials).min())
 
 
 def _on_off(name: str, maps: dict[str, NDArray]) -> str:

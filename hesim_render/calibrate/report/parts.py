@@ -3,13 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hesim_render.calibrate.summary import beside
+from hesim_render.core.drawing import points
 from hesim_render.core.html import number
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: Headings of the tables of parameters.
 HEAD = ("parameter", "value", "95 % interval", "unit, or why not")
+
+
+#: Mean number of events for which no event is counted with a probability of 5 %: −ln 0.05.
+UPPER_OF_NONE = 3.0
+
+
+def counted(
+    axes: Axes, x: NDArray, events: NDArray, trials: NDArray, colour: str, label: str = "", size: float = 3.4
+) -> None:
+    """Rates as points. Where nothing was counted, a triangle points down from the 95 % limit: a logarithmic axis has no
+    0.
+    """
+    some = events > 0
+    points(axes, x[some], events[some] / trials[some], colour, label, size)
+    axes.plot(
+        x[~some], UPPER_OF_NONE / trials[~some], color=colour, linestyle="none", marker=11, alpha=0.7,
+        label=f"_{label} none counted",
+    )  # fmt: skip
+
+
+def lowest(events: NDArray, trials: NDArray) -> float:
+    """Lowest value that `counted` draws."""
+    return float((np.where(events > 0, events, UPPER_OF_NONE) / trials).min())
+
+
+def scale_from_dark(axes: Axes, darkest_lit: float) -> None:
+    """A logarithmic axis of light, with the dark on it."""
+    axes.set_xscale("symlog", linthresh=10 ** np.floor(np.log10(darkest_lit)), linscale=0.5)
 
 
 #: Figures that a report begins with.

@@ -159,6 +159,7 @@ class ApsNoise(PlainState):
         t = exposure_us * S_PER_US
         for position in self.layout.spec.positions("aps"):
             beta = self.beta[position]
+            # linear in the light: the least value is at one of the ends
             gain = np.min(formulas.light_gain_dn(beta, np.array([0.0, self.full_scale_dn]), t))
             remainder = formulas.dark_variance_dn2(beta, t)
             for name, value in (("β1 + β3 I + β4 t", gain), ("β0 + β2 t + β5 t²", remainder)):

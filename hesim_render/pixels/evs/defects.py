@@ -109,6 +109,7 @@ def _measured(rates: EventDefectRates, key: NDArray[np.uint32]) -> PixelDefects:
     stuck = np.flatnonzero(rates.kind.ravel() == Defect.STUCK)
     every = rates.on_hz, rates.off_hz, rates.firing_share, rates.change_hz
     values = np.stack([values.ravel() for values in every]).astype(np.float64)
+    # pixels with a rate of their own, whatever the calibration called them
     place = np.flatnonzero((values[:2] > 0).any(axis=0))
     return PixelDefects(stuck, place, key[place], *values[:, place])
 
@@ -169,6 +170,7 @@ class DefectEvents:
     def _events_of(
         self, begin_us: float, end_us: float
     ) -> tuple[NDArray[np.float64], NDArray[np.uint32], NDArray[np.int8]]:
+        # events at the rate while firing; those in the quiet times of a flickering pixel are dropped
         which, t_us, mark = self._events.between(begin_us, end_us)
         which = self._firing[which]
         number = self._number[which]

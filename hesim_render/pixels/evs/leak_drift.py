@@ -84,6 +84,8 @@ class LeakDrift:
         self._per_us = self._speed(electrons) + dr.zeros(jit().Float64, self._theta_on.size)
         way = np.zeros(self._theta_on.size)
         if not is_reset:
+            # the time since the last event, between 0 and a whole drift: uniform where noise gives no events, else
+            # exponential
             per_us = np.maximum(np.array(self._per_us), 1e-30)
             whole_us, per_event = self._theta_on / per_us, events_hz / US_PER_S
             ends = per_event * whole_us  # noise events that a whole drift would have
@@ -136,18 +138,21 @@ class LeakDrift:
             pixel = events["y"].astype(np.uint32) * np.uint32(cols) + events["x"]
             order = np.argsort(pixel, kind="stable")
             place = types.UInt32(pixel[order])
+            # way of each event's pixel at the time of the event: the speed goes on a line between both samples
             way, before, after = (
                 np.array(dr.gather(types.Float64, values, place)) for values in (self._way, self._per_us, later)
             )
             own = pixel[order]
             elapsed = np.minimum(events["t_us"][order] - float(begin_us), length_us)
             at = way + (before + (after - before) * (0.5 / length_us) * elapsed) * elapsed
+            # what has drifted since the event before, which is of this call or an earlier one
             first = np.diff(own.astype(np.int64), prepend=-1) != 0
             since = at - np.where(first, self._at_event[own], np.append(0.0, at[:-1]))
             drifted = (events["polarity"][order] == 1) & (since > 0.5 * self._theta_on[own])
             events["polarity"][order[drifted]] = Origin.DRIFT
             self._at_event = self._at_event.copy()  # a saved state keeps its own
             self._at_event[own] = at  # the last one of a pixel is written last
+        # whole steps of a long way are taken off, so that float32 levels keep their small ones
         way = self._way + (self._per_us + later) * dr.opaque(types.Float64, 0.5 * length_us)
         down = dr.floor(way / _FAR) * _FAR
         self._way, self._per_us = way - down, later

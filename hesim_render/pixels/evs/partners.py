@@ -76,6 +76,7 @@ class NominalSteps:
         -------
         Numbers of the steps, these and earlier ones, that the nominal thresholds have given now.
         """
+        # steps by pixel, then by time; own and nominal threshold of each step, by its direction
         order = np.argsort(steps.pixel, kind="stable")
         pixel, sign, number = (values[order] for values in (steps.pixel, steps.sign, steps.number))
         own, nominal = (theta[(sign < 0).astype(np.intp), pixel] for theta in (self._own, self._nominal))
@@ -93,6 +94,8 @@ class NominalSteps:
         farthest = sign[ends] * after[ends]
         farthest[goes_on] = np.maximum(farthest[goes_on], (sign[ends] * level[pixel[ends]])[goes_on])
 
+        # steps of earlier samples wait on: how far the level has gone for them is in the first run of their pixel.
+        # Where that runs the other way, the pixel has stepped back, and the goal is out of reach.
         before = self._waiting
         first_run = np.full(self._own.shape[1], -1)
         first_run[pixel[new_pixel]] = run[new_pixel]
@@ -106,6 +109,7 @@ class NominalSteps:
         else:
             turned = np.zeros(none.size, np.bool_)
 
+        # a step is reached if its run comes to the nominal threshold; it is final if its pixel has turned since
         every = _Waiting(*(np.concatenate(both) for both in zip(
             before, (pixel, sign, number, after + sign * (nominal - own)), strict=True
         )))  # fmt: skip
@@ -118,6 +122,7 @@ class NominalSteps:
         """Move the references of some pixels, in rising order, by differences of ln x."""
         if pixel.size == 0:
             return
+        # `pixel` is sorted: the place of the pixel of each waiting step in it, if it is there
         place = np.minimum(np.searchsorted(pixel, self._waiting.pixel), pixel.size - 1)
         result = pixel[place] == self._waiting.pixel
         self._waiting.goal[result] += by[place[result]]
@@ -187,14 +192,17 @@ class Partners:
         """
         assert stage.t_us is not None
         is_first = self._own.t_us is None
+        # the noise-free pixels take the same sample; each of their steps gets a number
         own = self._own.step(electrons, stage.t_us)
         steps = as_steps(own, self._steps + np.arange(own.size), self._cols)
+        # only events of a crossing can follow from a step; leaks and defects come by themselves
         of_comparator = (origin == Origin.COMPARATOR) | (origin == Origin.DRIFT)
         effects = as_steps(events[of_comparator], number[of_comparator], self._cols)
         cause, effect, lost = self._of_events.take(steps, effects)
         asleep = own[np.sort(lost) - self._steps]
         self._steps += own.size
         self._stepped[steps.pixel] = self._stepped[effects.pixel] = True
+        # with a dead time, noise-free pixels that have it as well decide the labels
         if self._with_dead_time is not None:
             decided = self._with_dead_time.take(stage, electrons, stage.t_us, effects, self._verdicts)
         else:
@@ -309,6 +317,7 @@ class _Verdicts:
         undecided : steps that it may give later.
         pairs : where steps wait for events.
         """
+        # pairs [2, n] of events that are in the recording
         new = np.stack([cause, effect])[:, effect >= 0]
         if not self._differ:
             return new[1], np.full(new.shape[1], Label.SIGNAL, np.uint8)
@@ -316,9 +325,11 @@ class _Verdicts:
         self._open = np.concatenate([self._open, new], axis=1)
         self._given = np.concatenate([self._given, given])
         cause, effect = self._open
+        # signal is final; a new pair without its step is mismatch until that step comes
         signal = np.isin(cause, self._given)
         decided = signal | (np.arange(cause.size) >= old)
         self._open, self._given = self._open[:, ~signal], self._given[~np.isin(self._given, cause[signal])]
+        # what no step or event can complete any more is let go, now and then, so that memory does not grow
         if self._open.shape[1] + self._given.size > self._enough:
             self._open = self._open[:, np.isin(self._open[0], undecided)]
             self._given = self._given[np.isin(self._given, pairs.waiting(CAUSE))]

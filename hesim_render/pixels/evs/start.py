@@ -85,12 +85,15 @@ class Law(NamedTuple):
 
 def law(pixels: Pixels) -> Law:
     """The law of each pixel."""
+    # a Markov chain over levels of comparison, [pixel, level]: rates at which noise or a reset ends a stay there
     up = _crossings(pixels.on[:, None] + _GRID, pixels.angle)
     down = _crossings(pixels.off[:, None] - _GRID, pixels.angle)
     out = up + down + pixels.leak
+    # and where each leads, [pixel, level, next level]
     to = up[..., None] * _landing(pixels.on[:, None] + _GRID, 1.0, pixels.dead)
     to += down[..., None] * _landing(_GRID - pixels.off[:, None], -1.0, pixels.dead)
     to += pixels.leak * _weights(np.zeros(1), 1.0)
+    # share of visits of each level, and of time: a level that is left late counts more
     visits = _stationary(to / out[..., None])
     waits = visits / out
     cycle = waits.sum(axis=1) + pixels.dead
@@ -132,6 +135,7 @@ def _weights(mean: NDArray[np.float64], deviation: float) -> NDArray[np.float64]
 
 def _stationary(chances: NDArray[np.float64]) -> NDArray[np.float64]:
     """Stationary laws [n, k] of Markov chains [n, k, k]. No sum depends on the number of threads."""
+    # elimination of one level after the other (Grassmann, Taksar and Heyman): no differences, so no cancellation
     rest, count = chances.copy(), chances.shape[-1]
     for k in range(count - 1, 0, -1):
         rest[:, :k, k] /= rest[:, k, :k].sum(axis=1, keepdims=True)

@@ -18,7 +18,7 @@ from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.tracer import PixelTracer
 
 #: Pixels along each side of the sensor at which the mean is measured, one at random in each cell of an even grid; and
-#: groups of intervals of time that are told apart.
+#: groups of intervals of time that are distinguished.
 _CELLS, _GROUPS = 32, 16
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -134,7 +135,8 @@ class Resampler:
         if not self._mapping.rows.is_plain:
             index = dr.arange(types.UInt32, rows * self._width)
             row = index // self._width
-            planes = self._sum(planes, row, index - row * self._width, 0, self._width)
+            source_col = index - row * self._width
+            planes = self._sum(planes, 0, row, lambda source_row: source_row * self._width + source_col)
             dr.eval(planes)
             first_row = None
         else:
@@ -143,36 +145,30 @@ class Resampler:
         row = index // cols
         col = index - row * cols
         source_row = row if first_row is None else dr.gather(types.UInt32, first_row, row)
-        return self._sum_cols(planes, source_row, col)
+        return self._sum(planes, 1, col, lambda source_col: source_row * self._width + source_col)
 
-    def _sum(self, planes: list[Float], row: UInt32, col: UInt32, which: int, width: int) -> list[Float]:
-        """Weighted sum of source rows."""
+    def _sum(
+        self, planes: list[Float], which: int, target: UInt32, place_of: Callable[[UInt32], UInt32]
+    ) -> list[Float]:
+        """Weighted sum of source rows (`which` 0) or columns (1) for target rows or columns.
+
+        Parameters
+        ----------
+        planes : of the source.
+        target : row or column of the region, of each lane.
+        place_of : place in a plane of a source row or column, of each lane.
+        """
         import drjit as dr
 
         types = jit()
-        first = dr.gather(types.UInt32, self._first[which], row)
-        last = self._mapping.source_shape[0] - 1
+        axis = (self._mapping.rows, self._mapping.cols)[which]
+        first = dr.gather(types.UInt32, self._first[which], target)
+        last = self._mapping.source_shape[which] - 1
         totals: list[Float] = [0.0 for _ in planes]
-        for tap in range(self._mapping.rows.weight.shape[1]):
-            weight = dr.gather(types.Float, self._weight[which], row + tap * self._shape[which])
-            place = dr.minimum(first + tap, last) * width + col
-            totals = [
-                dr.fma(weight, dr.gather(types.Float, plane, place), total)
-                for plane, total in zip(planes, totals, strict=True)
-            ]
-        return totals
-
-    def _sum_cols(self, planes: list[Float], source_row: UInt32, col: UInt32) -> list[Float]:
-        """Weighted sum of source columns in the given lines."""
-        import drjit as dr
-
-        types = jit()
-        first = dr.gather(types.UInt32, self._first[1], col)
-        last = self._width - 1
-        totals: list[Float] = [0.0 for _ in planes]
-        for tap in range(self._mapping.cols.weight.shape[1]):
-            weight = dr.gather(types.Float, self._weight[1], col + tap * self._shape[1])
-            place = source_row * self._width + dr.minimum(first + tap, last)
+        for tap in range(axis.weight.shape[1]):
+            weight = dr.gather(types.Float, self._weight[which], target + tap * self._shape[which])
+            # beyond the last one the weight is 0
+            place = place_of(dr.minimum(first + tap, last))
             totals = [
                 dr.fma(weight, dr.gather(types.Float, plane, place), total)
                 for plane, total in zip(planes, totals, strict=True)

@@ -13,7 +13,7 @@ from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sources.render.light_level import light_levels
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.truth import imu
-from hesim_render.sources.render.truth.flow import _unhidden
+from hesim_render.sources.render.truth.flow import _unoccluded
 from hesim_render.sources.render.truth.imu import ImuModel
 from hesim_render.sources.render.truth.poses import camera_model
 from hesim_render.sources.render.truth.raster import Raster
@@ -712,7 +712,7 @@ def test_what_may_hide_a_point_is_looked_for_from_the_camera_at_the_time_of_its_
     which, row, group = np.array([1, 2, 4, 5]), np.arange(6) + 3, np.array([9, 0, 1, 9, 0, 1])
     distance = np.array([9, 1.0, 2.0, 9, np.inf, 4.0], np.float32)
     corner = np.arange(12.0).reshape(6, 2)
-    found = _unhidden(rays, after, before, surfaces, group, np.arange(6), row, which, corner, distance)
+    found = _unoccluded(rays, after, before, surfaces, group, np.arange(6), row, which, corner, distance)
     assert found.tolist() == [True, False, True, True] and asked[0][1].tolist() == (row[which] + 7).tolist()
     part = np.zeros(4) if is_global else share
     for k, (n, own) in enumerate(zip(which, (0, 1, 3, 2), strict=True)):

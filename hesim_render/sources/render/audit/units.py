@@ -165,6 +165,7 @@ class NotedFlux:
         return _Open(self._rng.choice(among, self._of_events), skipped)
 
     def _close(self, pixel: NDArray[np.uint32], one: _Open) -> None:
+        # number of each window within the unit: before, judged or after
         number = np.arange(len(one.halves)) + one.skipped
         core = (number >= self._before) & (number < self._before + self._core)
         if core.any():

@@ -58,6 +58,7 @@ class Aims:
         """
         if not parts:
             return None
+        # one number for each pair, and its objects behind one another, in order of their numbers
         keys = np.concatenate([window * sites + site for window, site, _ in parts])
         group = np.concatenate([group for _, _, group in parts])
         order = np.lexsort((group, keys))
@@ -67,6 +68,7 @@ class Aims:
     def at(self, window: NDArray[np.integer], site: NDArray[np.integer]) -> PairAims:
         """The objects of listed pairs, [n]."""
         wanted = window.astype(np.int64) * self.sites + site
+        # pairs that are not in the list have no objects; the sentinel −1 is no key
         place = np.searchsorted(self.key, wanted)
         known = np.append(self.key, -1)[place] == wanted
         first = np.where(known, self.first[place], 0)
@@ -115,11 +117,13 @@ def in_blocks(
         if has_any is not None:
             alike.append((np.flatnonzero(has_any), kind))
             plain &= ~has_any
+    # plain pairs first; where there are no others, a slice saves the copy
     alike.insert(0, (np.flatnonzero(plain) if alike else None, None))
     for places, aimed in alike:
         ends = np.cumsum(packets if places is None else packets[places])
         first = 0
         while first < ends.size:
+            # as many pairs as there is room for, one at least
             done = int(ends[first - 1]) if first else 0
             last = max(first + 1, int(np.searchsorted(ends, done + room, side="right")))
             part = slice(first, last) if places is None else places[first:last]
@@ -233,6 +237,7 @@ class Aim:
         import drjit as dr
 
         types = jit()
+        # an aimed ray: a point of the square around its object, at its own instant
         own = self._square(dr.gather(types.UInt32, lanes.group, lanes.first + slot), now, camera, centre)
         aimed = own.low_x + own.wide * point[0], own.low_y + own.high * point[1]
         x, y = (dr.select(lanes.is_aimed, a, b) for a, b in zip(aimed, uniform, strict=True))
@@ -247,6 +252,7 @@ class Aim:
         density = density / lanes.count
         pixel = self._rays.density(x, y, centre)
         # an aimed ray whose object is not there at this instant finds nothing
+        # balance heuristic: the pixel's density over the mean of both
         meets = (pixel > 0) & (~lanes.is_aimed | (own.density > 0))
         weight = dr.select(meets, 2 * pixel / (pixel + density), 0)
         return x, y, weight

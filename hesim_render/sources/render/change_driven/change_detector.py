@@ -84,7 +84,7 @@ def windows_with_changes(
     first: FirstLook,
     width_px: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Windows between the first and the last one that need a closer look, in order of windows.
+    """Windows between the first and the last one that are refined, in order of windows.
 
     Each is compared with the first window, by the same rays. It counts if it, or the one before or after it, differs;
     of pixels that are not even, all windows count.

@@ -210,6 +210,7 @@ class ChangeDrivenFlux:
         if self._is_dark or pixel.size == 0:
             return np.zeros(4)
         renderer, windows, rays = self._renderer, Windows(begin_us, end_us), np.zeros(4)
+        # what is traced here is no work of the run: its counts are put back at the end
         counts, done = replace(renderer.counts), self._tracer.rays_done
         later = max(1, windows.size - 1)
         for band in renderer.bands(pixel, role):
@@ -223,6 +224,7 @@ class ChangeDrivenFlux:
             against = () if anchor is None else (anchor.pilot, renderer.look_stride)
             pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, *against)
             rays[3] += share * (renderer.counts.pilot_rays - before)
+            # the same plan as in a run, of which the rays are counted and not traced
             what = renderer.plan(pilot, band, is_knot=role == "events").until(
                 windows.size - 1 if until is None else until
             )
@@ -230,6 +232,7 @@ class ChangeDrivenFlux:
             if windows.size > 1:
                 what, fit, _ = renderer.follow(band, windows, numbers[:, : band.place.size], what)
             rays[0] += self._tracer.rays_done - before
+            # the first window of a block belongs to the block before
             todo = what.rendered.copy()
             todo[:-later] = False
             if anchor is not None:
@@ -252,6 +255,7 @@ class ChangeDrivenFlux:
         if self._is_dark:
             return float("inf")
         done = self._tracer.rays_done
+        # pixels evenly over the region, as rays cost more where there is more to meet
         index = self._index[np.linspace(0, self._index.size - 1, min(self._index.size, 8192)).astype(np.int64)]
         window, seconds = Windows(np.zeros(1), np.full(1, 1000.0)), np.inf
         for _ in range(2):  # the first pass compiles the kernel
@@ -312,6 +316,7 @@ class ChangeDrivenFlux:
                 flux, alive, base = work.take(block), work.alive, work.base
             for window in np.flatnonzero(block.wanted):
                 self.counts.values += pixels.size
+                # constant pixels keep the flux of the anchor; those that may change have that of this window
                 values = [part[0].copy() for part in base.arrays]
                 for whole, part in zip(values, flux.at(int(window)).arrays, strict=True):
                     whole[alive] = part[0]

@@ -43,6 +43,7 @@ class Sites:
     @classmethod
     def around(cls, pixel: NDArray[np.uint32], rows: int, cols: int) -> Sites:
         """Listed pixels with their neighbours up to `REACH` away, on a full sensor of the given size."""
+        # the smallest rectangle [row, col] with all listed pixels and their neighbours, cut to the sensor
         row, col = np.divmod(pixel.astype(np.int64), cols)
         top, bottom = max(0, int(row.min()) - REACH), min(rows, int(row.max()) + REACH + 1)
         left, right = max(0, int(col.min()) - REACH), min(cols, int(col.max()) + REACH + 1)
@@ -50,10 +51,12 @@ class Sites:
         wanted = np.zeros((shape[0] + 2 * REACH, shape[1] + 2 * REACH), np.bool_)
         inner = wanted[REACH:-REACH, REACH:-REACH]
         inner[row - top, col - left] = True
+        # sites are the cells of the rectangle with a listed pixel within reach, in row-major order
         near = np.zeros(shape, np.bool_)
         for down in range(2 * REACH + 1):
             for right_ in range(2 * REACH + 1):
                 near |= wanted[down : down + shape[0], right_ : right_ + shape[1]]
+        # number of each cell among the sites, where it is one
         cell = np.flatnonzero(near)
         place = np.cumsum(near.ravel()) - 1
         site_row, site_col = np.divmod(cell, shape[1])
@@ -68,6 +71,7 @@ class Sites:
         """Mean of `values` [m] over the sites in the 3×3 neighbourhood of each listed pixel, [n]."""
         if self.shape is None:
             return values[self.listed]
+        # near the rim of the sensor there are fewer than nine
         if not self._count:
             self._count.append(self._sum(np.ones(self.size, np.float32)))
         return self._sum(values) / self._count[0]
@@ -83,6 +87,7 @@ class Sites:
             return values[self.listed]
         lowest = False if values.dtype == np.bool_ else -np.inf
         image = self._image(values, radius, lowest)
+        # along rows, then along columns: 4r steps in place of (2r + 1)²
         cols, rows = image.shape[1] - 2 * radius, image.shape[0] - 2 * radius
         across = image[:, :cols]
         for shift in range(1, 2 * radius + 1):
@@ -122,6 +127,7 @@ class Sites:
 
 def turns(row: NDArray[np.integer], window: NDArray[np.integer]) -> NDArray[np.int64]:
     """For each pair: the number of other windows of its row that come first, [n]."""
+    # distinct pairs in order of row, then of window: the rank of each counts from the first of its row
     pairs, place = distinct_columns(np.stack([row.astype(np.int64), window.astype(np.int64)]))
     if pairs.shape[1] == 0:
         return np.empty(0, np.int64)
@@ -134,5 +140,6 @@ def of_own_row(sites: Sites, window: NDArray[np.integer], cols: int) -> NDArray[
     """Window of each site: that of the listed pixels in its row, or in the nearest row that has any."""
     row, listed = sites.index.astype(np.int64) // cols, sites.index[sites.listed].astype(np.int64) // cols
     rows, first = np.unique(listed, return_index=True)
+    # the middle between two rows parts the sites of one from those of the other
     nearest = np.searchsorted((rows[1:] + rows[:-1]) / 2, row)
     return window[first[nearest]].astype(np.int64)

@@ -130,6 +130,7 @@ class PilotFlux:
         per_share = dr.opaque(types.Float, 1 / alike)
         for values, name in ((controlled, "controlled"), (plain, "plain")):
             mean = dr.block_sum(values, samples) * share
+            # about the mean of each kind: what differs between kinds is no scatter
             own = dr.block_sum(values, alike) * per_share
             deviation = values - dr.gather(types.Float, own, kind)
             # relative to the largest one, as fourth powers of fluxes leave the range of float32
@@ -143,6 +144,7 @@ class PilotFlux:
         for values, other, name in zip(
             (controlled, plain), before or (), ("controlled_change", "plain_change"), strict=False
         ):
+            # the same rays in both windows: what they have in common drops out
             difference = values - other
             mean = dr.block_sum(difference, samples) * share
             deviation = difference - dr.gather(types.Float, mean, pair)

@@ -8,8 +8,11 @@ from hesim_render.core.backend import jit
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 
+#: Rows and columns of the grid.
+_ROWS, _COLS = 24, 32
 
-def least_depth_m(tracer: PairTracer, t_us: float, grid: tuple[int, int] = (24, 32)) -> float:
+
+def least_depth_m(tracer: PairTracer, t_us: float) -> float:
     """Least depth of the resting surfaces in view at a time, over an even grid of the picture, m.
 
     Depth is measured along the camera's axis. It is infinite where nothing is seen.
@@ -19,11 +22,11 @@ def least_depth_m(tracer: PairTracer, t_us: float, grid: tuple[int, int] = (24, 
     mitsuba()  # the variant may have been changed by other code
     mi, types, geometry, view = tracer.built.mi, jit(), tracer.sensor.spec.geometry, tracer.view
     left, right, top, bottom = view.followed_mm
-    x = left + (np.arange(grid[1]) + 0.5) / grid[1] * (right - left)
-    y = top + (np.arange(grid[0]) + 0.5) / grid[0] * (bottom - top)
+    x = left + (np.arange(_COLS) + 0.5) / _COLS * (right - left)
+    y = top + (np.arange(_ROWS) + 0.5) / _ROWS * (bottom - top)
     pitch_mm = geometry.pitch_um * 1e-3
-    row = np.repeat(y / pitch_mm + (geometry.rows - 1) / 2, grid[1])
-    col = np.tile(x / pitch_mm + (geometry.cols - 1) / 2, grid[0])
+    row = np.repeat(y / pitch_mm + (geometry.rows - 1) / 2, _COLS)
+    col = np.tile(x / pitch_mm + (geometry.cols - 1) / 2, _ROWS)
     rows, cols = (types.Float(values.astype(np.float32)) for values in (row, col))
     origin, direction = tracer.rays.towards(rows, cols, types.Float(0), types.Float(0))
     axis = -view.camera_to_world[:3, 2]

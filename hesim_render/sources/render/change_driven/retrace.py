@@ -50,6 +50,7 @@ class KnownPairs:
         begin_us, end_us : [n], the windows, µs.
         traced : gives the values of some of them, by their places in these lists.
         """
+        # a hash that is known leads to one place; whether the pair there is the same is compared in full
         pairs = np.stack([index.astype(np.float64), begin_us, end_us])
         hashed = _hash(pairs)
         place = np.minimum(np.searchsorted(self._hash, hashed), max(0, self._hash.size - 1))
@@ -109,24 +110,29 @@ def traced_again(
     -------
     [2, n], e⁻/s: the flux, and half the difference of its halves.
     """
+    # each pair once, however often it was drawn; `place` leads back to the draws
     pairs, place = np.unique(np.stack([index.astype(np.float64), begin_us, end_us]), axis=1, return_inverse=True)
     pixel = pairs[0].astype(np.uint32)
     span, window = distinct_columns(pairs[1:])
     windows = Windows(span[0], span[1])
     aims = _aims(zoom, pixel, tracer.sensor.spec.geometry.cols, windows, window)
     pilot = _pilot(tracer, pixel, windows, window, tuning.audit_pilot_rays, aims)
+    # the estimator with less scatter, as in the run, by a pilot of its own
     controlled = (pilot.controlled_scatter <= pilot.plain_scatter) & (2 * pilot.controlled >= pilot.unshadowed)
     flux = np.where(controlled, pilot.controlled, pilot.plain)
     scatter = np.where(controlled, pilot.controlled_scatter, pilot.plain_scatter)
+    # rays for the wanted error of the scatter, and so many that no ray weighs too much
     own_unit = unit_of(pixel)
     wanted_error = np.float32(quality) * own_unit(flux)
     wanted = np.maximum(
         gain.rays(scatter / wanted_error), pilot.unshadowed / (np.float32(tuning.audit_ray_weight) * wanted_error)
     )
     rays = 1 << np.ceil(np.log2(np.clip(wanted, tuning.least_audit_rays, tuning.most_rays))).astype(np.int64)
+    # where the largest number of rays does not do, the pair is traced several times
     wanted_times = np.ceil((gain.error(scatter, rays) / wanted_error) ** 2)
     edges: PairEdges | None = None
     if tracer.rays.is_box:
+        # edges are looked for where that may save rays; what is known of an edge needs no repetition
         law, floor = rays, np.full(rays.size, tuning.least_audit_rays)
         tried = law >= tuning.edge_least_audit_rays
         if aims is not None:
@@ -137,6 +143,7 @@ def traced_again(
         )  # fmt: skip
         wanted_times = np.where(rays < law, 1, wanted_times)
     times = np.clip(wanted_times, 1, tuning.most_audit_times).astype(np.int64)
+    # one entry a repetition, with random numbers by its number; the mean is taken over those of a pair
     each, first = np.repeat(np.arange(pixel.size), times), np.cumsum(times) - times
     of = pixel[each], window[each], windows, rays[each], controlled[each], Stream.AUDIT
     repeat = np.arange(each.size) - first[each]

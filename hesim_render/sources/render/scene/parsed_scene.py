@@ -64,7 +64,7 @@ def _without_normals(state: Any) -> Callable[[str], bool]:
     Raises
     ------
     SpecError
-        If a 'merge' has meshes of both kinds, whose vertices cannot be told apart afterwards.
+        If a 'merge' has meshes of both kinds, whose vertices cannot be distinguished afterwards.
     """
     files = {}
     for number, node in enumerate(state.nodes):

@@ -110,10 +110,16 @@ class Trajectory:
 
     def matrix(self, t_us: ArrayLike) -> NDArray[np.float64]:
         """Pose at one or many times: 4×4 rigid matrices, shape [..., 4, 4] for times of shape [...]."""
-        local = self.local_us(t_us)
+        return self.within(*self.segments(self.local_us(t_us))[:2])
+
+    def segments(
+        self, local_us: NDArray[np.float64]
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+        """Segment of times since the first keyframe, the share of it that has passed, and its length, µs."""
         knots = self.knots_us - self.knots_us[0]
-        segment = np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2)
-        return self.within(segment, (local - knots[segment]) / (knots[segment + 1] - knots[segment]))
+        segment = np.clip(np.searchsorted(knots, local_us, side="right") - 1, 0, knots.size - 2)
+        length = knots[segment + 1] - knots[segment]
+        return segment, (local_us - knots[segment]) / length, length
 
     def throughout(self, times_us: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Segments of time intervals [...], and poses at times of each, [..., k, 4, 4], for times of shape [..., k].
@@ -121,12 +127,12 @@ class Trajectory:
         No time of `ends_us` may lie inside an interval. At its end the pose is the one before the jump of a repeating
         track.
         """
+        # the middle of an interval tells its segment; its ends may be keyframes, which belong to two
         middle = 0.5 * (times_us[..., 0] + times_us[..., -1])
         knots, local = self.knots_us - self.knots_us[0], self.local_us(middle)
-        segment = np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2)
+        segment, _, length = self.segments(local)
         if not self.repeat:  # the pose is held before and after
             local = middle - self.knots_us[0]
-        length = knots[segment + 1] - knots[segment]
         share = (local[..., None] + times_us - middle[..., None] - knots[segment][..., None]) / length[..., None]
         return segment, self.within(np.broadcast_to(segment[..., None], share.shape), np.clip(share, 0.0, 1.0))
 
@@ -139,6 +145,7 @@ class Trajectory:
         translation = start + share[..., None] * (self.translation_m[segment + 1] - start)
         pose = np.zeros((*share.shape, 4, 4))
         pose[..., :3, :3] = rotation
+        # translate · pivot + R (x − pivot), as one matrix
         pose[..., :3, 3] = translation + self.pivot_m - rotation @ self.pivot_m
         pose[..., 3, 3] = 1.0
         return pose
@@ -156,6 +163,7 @@ class Trajectory:
         elif end_us - begin_us >= period:
             spans = [(0.0, period)]
         else:
+            # an interval that passes the last keyframe goes on from the first
             first = float(self.local_us(begin_us))
             last = first + end_us - begin_us
             spans = [(first, last)] if last <= period else [(first, period), (0.0, last - period)]

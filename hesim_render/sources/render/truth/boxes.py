@@ -27,8 +27,9 @@ class Boxes:
     names : names of the objects, without the background.
     visible_px : [object, 4], left, top, right, bottom of the pixels that show the object, in px of the grid: borders of
         pixels, so that one pixel at (0, 0) has −0.5, −0.5, 0.5, 0.5. NaN where none shows it.
-    whole_px : [object, 4], the same of the whole object, hidden parts and parts beside the picture included, exact for
-        meshes and spheres and of the box in space for other shapes; NaN if a part of it is not in front of the camera.
+    whole_px : [object, 4], the same of the whole object, occluded parts and parts beside the picture included, exact
+        for meshes and spheres and of the box in space for other shapes; NaN if a part of it is not in front of the
+        camera.
         With a rolling shutter, at the time of the middle row.
     corners_m : [object, 8, 3], corners of the box in space, world, m. It is parallel to the world's axes while the
         object is at its place in the scene file, and moves with it.
@@ -86,6 +87,7 @@ class ObjectShapes:
             if part is not None:
                 rows, cols = part
                 visible[number] = cols.start - 0.5, rows.start - 0.5, cols.stop - 0.5, rows.stop - 0.5
+        # the whole object is at one time, that of the middle row
         middle = PoseTable(rays, np.array([times_us[(times_us.size - 1) // 2]]))
         pose = middle.groups[rays.names.group_of, 0]
         to_camera = inverse(middle.camera[0]) @ pose

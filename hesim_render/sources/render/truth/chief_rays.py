@@ -113,6 +113,7 @@ class ChiefRays:
 
     def _moment(self, t_us: NDArray[np.float64]) -> tuple[Moments, NDArray[np.float32]]:
         """All times as shares of one window."""
+        # one window from the first to the last time, so that each ray may have its own
         span = float(t_us.min()), float(t_us.max())
         windows = Windows(np.array(span[:1]), np.array(span[1:]))
         tracks = self.tracks + ([self.camera] if self.camera else [])
@@ -157,6 +158,7 @@ class ChiefRays:
             surface = self.parts.intersect(ray, now, True, mi.Bool(True), mi.RayFlags.Minimal)
             rest, lanes = surface.rest, part.stop - part.start
             met = rest.is_valid()
+            # normals point to the side of the camera; of an instance of a group, the instance is what has a name
             facing = dr.select(dr.dot(surface.world.n, ray.d) > 0, -1.0, 1.0)
             instance: UInt32 = dr.reinterpret_array(types.UInt32, rest.instance)
             own: UInt32 = dr.reinterpret_array(types.UInt32, rest.shape)
@@ -212,6 +214,7 @@ class ChiefRays:
             rest = surface.rest
             met = rest.is_valid()
             bsdf = rest.bsdf()
+            # glass and metal have no diffuse part: they are drawn as clear
             reflected = bsdf.eval_diffuse_reflectance(rest, met)
             clear = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
             reflected = dr.select(clear & ~dr.any(reflected > 0), CLEAR, reflected)
@@ -236,7 +239,7 @@ class ChiefRays:
 
         Returns
         -------
-        [n]; surfaces within the last 1e-4 of the way do not hide a point.
+        [n]; surfaces within the last 1e-4 of the way do not occlude a point.
         """
         way = points - origin
         length = np.linalg.norm(way, axis=1)

@@ -50,6 +50,7 @@ def flow_between(rays: ChiefRays, raster: Raster, surfaces: Surfaces, to_us: NDA
     to_us : second time of each mosaic row, [rows], µs.
     """
     before, after = PoseTable(rays, surfaces.times_us), PoseTable(rays, to_us)
+    # from the rest pose of each group to the camera at the second time, [group, row, 4, 4]
     relative = inverse(after.camera) @ after.groups
     count = raster.col.size
     place = np.empty((count, 2))
@@ -63,10 +64,12 @@ def flow_between(rays: ChiefRays, raster: Raster, surfaces: Surfaces, to_us: NDA
 
     def follow(part: slice) -> None:
         own, which = before.index(row[part]), group[part]
+        # the point and its normal, taken back from the first time to where their object rests
         point = surfaces.points(col[part], row[part] + first_row, distance[part], before.camera[own])
         rest = np.einsum("nij,nj->ni", inverse(before.groups[which, own]), point)
         turned = np.swapaxes(before.groups[which, own][:, :3, :3], 1, 2)
         rest_normal = np.einsum("nij,nj->ni", turned, normal[part].astype(np.float64))
+        # the row that sees the point sets its time, and the time sets the row: from the own row, until both agree
         seen = row[part].astype(np.float64)
         for _ in range(_MOST_STEPS):
             low, high, share = after.between(seen)
@@ -80,6 +83,7 @@ def flow_between(rays: ChiefRays, raster: Raster, surfaces: Surfaces, to_us: NDA
             if after.is_global or not np.any(moved > _SETTLED_PX):
                 break
         place[part] = there
+        # a surface that has turned away cannot be seen; the sky has no side
         towards = -np.einsum("nij,nj,ni->n", matrix[:, :3, :3], rest_normal, local)
         settled = np.isfinite(moved) & (after.is_global | ~(moved > _SETTLED_PX))
         facing[part] = settled & ((towards > 0) | ~np.isfinite(distance[part]))
@@ -89,15 +93,16 @@ def flow_between(rays: ChiefRays, raster: Raster, surfaces: Surfaces, to_us: NDA
     flow = ((place - start) / np.array(raster.step)).astype(np.float32)
     corner = place - np.array(raster.first)
     size = np.array([rays.sensor.cols, rays.sensor.rows])
+    # only points that face the camera within the picture are worth a ray
     candidate = np.flatnonzero(facing & np.all((corner >= -0.5) & (corner <= size - 0.5), axis=1))
     visible = np.zeros(count, np.bool_)
     for first in range(0, candidate.size, BLOCK_RAYS):
         which = candidate[first : first + BLOCK_RAYS]
-        visible[which] = _unhidden(rays, after, before, surfaces, group, col, row, which, corner, distance)
+        visible[which] = _unoccluded(rays, after, before, surfaces, group, col, row, which, corner, distance)
     return Flow(flow.reshape(*raster.shape, 2), visible.reshape(raster.shape))
 
 
-def _unhidden(
+def _unoccluded(
     rays: ChiefRays,
     after: PoseTable,
     before: PoseTable,
@@ -123,6 +128,7 @@ def _unhidden(
     t_us, origin = after.times_at(corner[which, 1]), camera[:, :3, 3]
     clear = np.zeros(which.size, np.bool_)
     sky = np.isinf(distance[which])
+    # a point of a surface is at a distance, a direction of the sky is not
     clear[~sky] = rays.sees(there[~sky], t_us[~sky], origin[~sky])
     if sky.any():
         clear[sky] = rays.sees_sky(there[sky], t_us[sky], origin[sky])

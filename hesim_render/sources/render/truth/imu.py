@@ -104,15 +104,19 @@ def imu_samples(rays: ChiefRays, model: ImuModel, begin_us: float, end_us: float
     count = int(np.floor((end_us - begin_us) / period_us + 1e-9))
     edges: NDArray[np.float64] = np.linspace(begin_us, begin_us + period_us * count, count + 1, dtype=np.float64)
     step_s = period_us * S_PER_US
+    # orientations at the ends of the samples, and in their middles, [n, 3, 3]
     rotation = (rays.camera_to_world(edges) @ VISION_AXES)[:, :3, :3]
     middle = (rays.camera_to_world(edges[:-1] + period_us / 2) @ VISION_AXES)[:, :3, :3]
+    # the mean rate over a sample is the whole turn in it, as a gyroscope integrates
     turn = np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:]
     gyro = Rotation.from_matrix(turn).as_rotvec() / step_s if count else np.empty((0, 3))
+    # likewise the mean acceleration is the change of velocity; gravity is felt as the opposite of a fall
     velocity = _velocity(rays.camera, rays.view.camera_to_world[:3, 3], edges)
     force = np.diff(velocity, axis=0) / step_s - np.asarray(model.gravity_m_per_s2, dtype=np.float64)
     accelerometer = np.einsum("nji,nj->ni", middle, force)
     normal = {kind: _normal(seed, number, count) for number, kind in enumerate(_KINDS)}
     root = step_s**0.5
+    # biases are random walks; white noise of a density falls with the root of the rate
     gyro_bias = np.cumsum(model.gyro_random_walk * root * normal["gyro_walk"], axis=0)
     own_bias = np.cumsum(model.accelerometer_random_walk * root * normal["accelerometer_walk"], axis=0)
     return ImuSamples(
@@ -143,15 +147,15 @@ def _velocity(track: Trajectory | None, place: NDArray[np.float64], t_us: NDArra
     """
     if track is None:
         return np.zeros((t_us.size, 3))
-    local, knots = track.local_us(t_us), track.knots_us - track.knots_us[0]
-    segment = np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2)
-    seconds = (knots[segment + 1] - knots[segment]) * S_PER_US
-    pose = track.within(segment, (local - knots[segment]) / (knots[segment + 1] - knots[segment]))
+    segment, share, length_us = track.segments(track.local_us(t_us))
+    seconds = length_us * S_PER_US
+    pose = track.within(segment, share)
+    # the place turns about the pivot: its speed is that of the pivot and ω × arm
     arm = pose[:, :3, :3] @ (place - track.pivot_m)
     turn = track.arc_axis[segment] * (track.arc_rad[segment] / seconds)[:, None]
     shift = (track.translation_m[segment + 1] - track.translation_m[segment]) / seconds[:, None]
     speed = shift + np.cross(turn, arm)
     if not track.repeat:  # the pose is held before and after
         own = t_us - track.knots_us[0]
-        speed[(own < 0) | (own >= knots[-1])] = 0.0
+        speed[(own < 0) | (own >= track.period_us)] = 0.0
     return speed

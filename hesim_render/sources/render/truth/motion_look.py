@@ -70,7 +70,7 @@ class MotionLook:
     stride : pixels of the region from one to the next.
     times_us : [time], µs.
     trails : [point, time, 2], column and row of points of surfaces that move, px of the region; NaN where a point is
-        not in front of the camera. What hides it does not count.
+        not in front of the camera. Occlusion does not count.
     speed_px_per_s : [point], speed at the wanted time; of all points, also of those at rest.
     moving : share of the points that move during the run.
     events : None for a sensor without event pixels.
