@@ -15,7 +15,7 @@ from hesim_render.sources.renderer import Demand, Estimate
 _START_S = 1.0
 #: A window of the event pixels: planning and bookkeeping of the renderer, s.
 _WINDOW_S = 5e-3
-#: A step of the event stage, and a step of event pixels behind a photoreceptor: s, and s for each event pixel.
+#: A step of the event stage, and a step of asynchronous pixels behind a photoreceptor: s, and s for each event pixel.
 _STEP_S, _STEP_PIXEL_S = 0.4e-3, 0.035e-6
 _BENT_STEP_S, _BENT_STEP_PIXEL_S = 2.5e-3, 0.035e-6
 #: A frame, and a pixel of a frame, through noise and into its file, s.
@@ -66,8 +66,10 @@ def noise_seconds(sensor: Sensor, duration_us: int, windows: float, *, rests: bo
         return 0.0
     pixels = sensor.layout.evs_pixel.size
     steps = max(windows, duration_us / evs.tick_us if evs.tick_us is not None else 0.0)
-    if evs.reference == "last_event" and evs.photoreceptor_cutoff_hz is not None:
+    is_asynchronous = evs.reference == "last_event"
+    if is_asynchronous and evs.photoreceptor_cutoff_hz is not None:
         steps += NODES_PER_CUTOFF_PERIOD * evs.photoreceptor_cutoff_hz * duration_us * S_PER_US
-    if evs.photoreceptor is not None and not rests:
+    # a tick behind a photoreceptor is one step as any other
+    if is_asynchronous and evs.photoreceptor is not None and not rests:
         return steps * (_BENT_STEP_S + _BENT_STEP_PIXEL_S * pixels)
     return steps * (_STEP_S + _STEP_PIXEL_S * pixels)

@@ -40,6 +40,10 @@ def test_steps_go_to_windows_and_to_nodes_of_the_noise():
     assert noise_seconds(hr.load_sensor("eiger").crop(64, 48), 123_900, 0.0, rests=True) == pytest.approx(
         100 * (0.4e-3 + 0.035e-6 * 32 * 24)
     )
+    bent_ticks = hr.load_sensor("eiger", {"evs.photoreceptor": {"cutoff_hz": 300.0, "follows_light": False}})
+    assert noise_seconds(bent_ticks.crop(64, 48), 123_900, 0.0, rests=False) == pytest.approx(
+        100 * (0.4e-3 + 0.035e-6 * 32 * 24)
+    )
     assert noise_seconds(hr.load_sensor("reference-bayer"), 50_000, 0.0, rests=False) == 0
 
 

@@ -140,7 +140,8 @@ class LastEvent:
             part = dr.opaque(jit().Float, (end_us - self._t_us) / (t_us - self._t_us))
             # ln x on a line from sample to sample, then through the filter
             level = dr.fma(log - self._log, part, self._log)
-            bends_us, begin = low_pass.nodes_us(end_us) if low_pass else [], low_pass.now if low_pass else None
+            # the photoreceptor at the begin, and its nodes on the way
+            begin, bends_us = (low_pass.now, low_pass.nodes_us(end_us)) if low_pass else (None, [])
             if low_pass:
                 level = low_pass.to(level, end_us)
             if self._band_noise:
