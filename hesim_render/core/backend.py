@@ -42,6 +42,9 @@ _BESIDE_EXTRA = ("libunwind", "libc++abi", "libc++")
 #: The value that this process itself wrote into DRJIT_LIBLLVM_PATH, as opposed to a choice of the user.
 _chosen_here = ""
 
+#: Device nodes of NVIDIA's driver, on Linux and on Windows' Linux.
+_GPU_NODES = ("/dev/nvidiactl", "/dev/dxg")
+
 _SYSTEM_FOLDERS = (
     "/usr/lib/x86_64-linux-gnu",
     "/usr/lib/aarch64-linux-gnu",
@@ -158,6 +161,10 @@ def candidates() -> list[BackendCandidate]:
 
 
 def _has_cuda() -> bool:
+    """Whether a GPU is worth a probe: its driver is named, runs, or is where the loader looks by itself."""
+    # containers often mount the driver where only LD_LIBRARY_PATH leads, which `find_library` does not search
+    if os.environ.get("DRJIT_LIBCUDA_PATH") or any(os.path.exists(node) for node in _GPU_NODES):
+        return True
     try:
         return ctypes.util.find_library("cuda") is not None
     except OSError:  # it may write a temporary file, for which there may be no place
@@ -283,7 +290,8 @@ def select() -> BackendCandidate:
         if result.backend == "llvm":
             for name in result.preload:
                 ctypes.CDLL(name)  # local: libc++ must not serve libraries that were built with libstdc++
-            _chosen_here = result.path
+            if result.path != os.environ.get("DRJIT_LIBLLVM_PATH"):  # what the user wrote there remains the user's
+                _chosen_here = result.path
             os.environ["DRJIT_LIBLLVM_PATH"] = result.path
         return result
     detail = f" (tried {'; '.join(tried)})" if tried else ""
@@ -306,4 +314,17 @@ def variant() -> str:
 def jit() -> Any:
     """Module with the Dr.Jit array types of the selected backend (``drjit.llvm.ad`` or ``drjit.cuda.ad``)."""
     with interrupts_held():
-        return importlib.import_module(f"drjit.{select().backend}.ad")
+        types = importlib.import_module(f"drjit.{select().backend}.ad")
+        set_compiler_flags()
+        return types
+
+
+def set_compiler_flags() -> None:
+    """Turn off what the compiler of the selected backend cannot do; for the calling thread, as all flags of Dr.Jit.
+
+    Dr.Jit 1.5 lets CUDA's compiler keep registers in shared memory. That compiler refuses this for kernels that call
+    functions by table, and Dr.Jit then ends the process.
+    """
+    if select().backend == "cuda":
+        drjit = importlib.import_module("drjit")
+        drjit.set_flag(drjit.JitFlag.SpillToSharedMemory, False)

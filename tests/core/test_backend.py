@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
@@ -187,3 +188,47 @@ def test_importing_the_package_loads_neither_drjit_nor_mitsuba():
     code = "import sys, hesim_render; print([m for m in ('drjit', 'mitsuba', 'numpy', 'colour') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_gpu_gets_no_kernels_that_its_compiler_refuses(monkeypatch):
+    """CUDA's compiler refuses registers in shared memory for kernels that call functions by table."""
+    import drjit as dr
+
+    flag = dr.JitFlag.SpillToSharedMemory
+    before = dr.flag(flag)
+    try:
+        dr.set_flag(flag, True)
+        backend.set_compiler_flags()
+        assert dr.flag(flag) == (backend.select().backend != "cuda")
+        monkeypatch.setattr(backend, "select", lambda: BackendCandidate("cuda", "GPU", ""))
+        backend.set_compiler_flags()
+        assert not dr.flag(flag)
+    finally:
+        dr.set_flag(flag, before)
+
+
+@pytest.mark.parametrize("hint", ["node", "variable", "loader"])
+def test_a_gpu_is_probed_wherever_its_driver_shows(fresh, tmp_path, hint):
+    """Containers mount the driver where `find_library` does not look."""
+    fresh.delenv("DRJIT_LIBCUDA_PATH", raising=False)
+    fresh.setattr(backend.ctypes.util, "find_library", lambda name: None)
+    fresh.setattr(backend, "_GPU_NODES", (str(tmp_path / "nvidiactl"),))
+    assert all(candidate.backend == "llvm" for candidate in backend.candidates())
+    if hint == "node":
+        (tmp_path / "nvidiactl").touch()
+    elif hint == "variable":
+        fresh.setenv("DRJIT_LIBCUDA_PATH", "/opt/driver/libcuda.so.1")
+    else:
+        fresh.setattr(backend.ctypes.util, "find_library", lambda name: f"lib{name}.so.1")
+    assert backend.candidates()[0].backend == "cuda"
+
+
+def test_a_library_that_the_user_named_stays_a_candidate(fresh, tmp_path):
+    """After it was chosen, a list of the candidates still has it."""
+    library = fake_library(tmp_path, 17)
+    fresh.setenv("DRJIT_LIBLLVM_PATH", str(library))
+    fresh.setattr(backend, "_chosen_here", "")
+    fresh.setattr(backend, "_probe_cached", lambda candidate: replace(candidate, version="17", works=True))
+    fresh.setattr(backend, "_adopt", lambda chosen: chosen)
+    assert select_anew().path == str(library)
+    assert (str(library), "DRJIT_LIBLLVM_PATH") in [(c.path, c.source) for c in backend.candidates()]

@@ -19,7 +19,7 @@ from hesim_render.sources.render.glare import VeilingGlare
 from hesim_render.sources.render.renderer import reported
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.timeline import Timeline
-from hesim_render.sources.render.tracer import BLOCK_RAYS, PixelTracer
+from hesim_render.sources.render.tracer import PixelTracer
 from hesim_render.sources.renderer import Demand, Estimate
 from hesim_render.sources.scene import Scene
 from hesim_render.sources.still import WindowByWindow
@@ -98,7 +98,7 @@ class RenderedFlux(WindowByWindow):
     seed : seed of the run.
     max_motion_px : largest motion of an object within a slice, pixels.
     progress : called with the number of rays traced so far, after each block.
-    block_rays : largest number of rays that are traced at a time.
+    block_rays : largest number of rays that are traced at a time; None takes `rays_at_once`.
     because : why the scene needs this mode, where nobody asked for it.
 
     Attributes
@@ -124,7 +124,7 @@ class RenderedFlux(WindowByWindow):
         *,
         max_motion_px: float = MAX_MOTION_PX,
         progress: Callable[[int], None] | None = None,
-        block_rays: int = BLOCK_RAYS,
+        block_rays: int | None = None,
         because: str | None = None,
     ) -> None:
         if not max_motion_px > 0:

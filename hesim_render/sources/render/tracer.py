@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.core.backend import jit
+from hesim_render.core.backend import jit, select
 from hesim_render.core.device_types import Bands, Float, Halves, UInt32, UInt64
 from hesim_render.core.errors import RangeError
 from hesim_render.core.journal import Journal, key_of
@@ -25,8 +25,16 @@ from hesim_render.sources.render.scene.parents import camera_trajectory
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.spectrum import Spectrum
 
-#: Number of rays traced at a time, to bound memory.
+#: Number of rays traced at a time on the CPU, to bound memory.
 BLOCK_RAYS = 1 << 20
+#: The same on a GPU, which a million rays keep busy for less time than the host takes to launch them.
+_GPU_BLOCK_RAYS = 1 << 22
+
+
+def rays_at_once() -> int:
+    """Number of rays that are traced at a time on the selected backend. No value depends on it."""
+    return _GPU_BLOCK_RAYS if select().backend == "cuda" else BLOCK_RAYS
+
 
 #: (mosaic index, u in [0, 1)) → the four wavelengths of a ray, nm.
 Wavelengths = Callable[[UInt32, Float], list[Float]]
@@ -42,7 +50,7 @@ class Tracer:
     scene, sensor : the scene and the sensor that sees it.
     responses : spectra that the scene must cover.
     progress : called with the number of rays traced so far, after each block.
-    block_rays : largest number of rays traced at a time.
+    block_rays : largest number of rays traced at a time; None takes `rays_at_once`.
 
     Attributes
     ----------
@@ -64,12 +72,12 @@ class Tracer:
         sensor: Sensor,
         responses: Mapping[str, Spectrum],
         progress: Callable[[int], None] | None,
-        block_rays: int,
+        block_rays: int | None,
     ) -> None:
         mi, types = mitsuba(), jit()
         import drjit as dr
 
-        self.progress, self._block_rays, self.rays_done = progress, block_rays, 0
+        self.progress, self._block_rays, self.rays_done = progress, block_rays or rays_at_once(), 0
         self._journal: Journal | None = None
         self._run_part: tuple[object, ...] = ()
         scene, _ = in_absolute_light(scene)
@@ -129,15 +137,16 @@ class PixelTracer(Tracer):
         seed: int,
         responses: Mapping[str, Spectrum],
         progress: Callable[[int], None] | None = None,
-        block_rays: int = BLOCK_RAYS,
+        block_rays: int | None = None,
     ) -> None:
         import drjit as dr
 
         if samples < 2 or samples % 2:
             raise RangeError("samples", samples, "an even number of rays per pixel, 2 or more")
-        if samples > block_rays:
-            raise RangeError("samples", samples, f"at most {block_rays} rays per pixel")
-        super().__init__(scene, sensor, responses, progress, block_rays)
+        most = block_rays or rays_at_once()
+        if samples > most:
+            raise RangeError("samples", samples, f"at most {most} rays per pixel")
+        super().__init__(scene, sensor, responses, progress, most)
         self.samples = samples
         self._full_index = self.sensor.layout.full_index.ravel()
         self._posed_us: float | None = None

@@ -52,6 +52,14 @@ def test_the_level_is_the_one_asked_for(tmp_path, rotation_deg):
     assert flux(tmp_path, other) != pytest.approx(expected, rel=0.03)
 
 
+def test_black_texels_dim_their_neighbours_as_in_mitsuba(tmp_path):
+    """Half of the texels are black. Spectrum and scale are interpolated apart, so the sky has 4 % less than their mean."""
+    write_map(tmp_path, (1.3 + np.cos(THETA)) * (np.random.default_rng(7).random((ROWS, COLS)) > 0.5))
+    expected = flux(tmp_path, {"type": "uniform", "illuminance_lux": 500}, samples=64)
+    light = {"type": "environment", "file": "map.exr", "illuminance_lux": 500, "rotation_deg": 20}
+    assert flux(tmp_path, light) == pytest.approx(expected, rel=8e-3)
+
+
 def test_the_upper_edge_is_up_and_the_middle_is_behind_the_camera(tmp_path):
     """Light from one half of the sphere alone reaches plates that face it."""
     up = {"type": "environment", "file": "map.exr", "illuminance_lux": 500, "plane_normal": [0, 1, 0]}

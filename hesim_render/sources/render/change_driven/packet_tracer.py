@@ -20,7 +20,7 @@ from hesim_render.sources.render.change_driven.edges import LaneEdges, PairEdges
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba, path_depths
-from hesim_render.sources.render.tracer import BLOCK_RAYS, Tracer
+from hesim_render.sources.render.tracer import Tracer
 from hesim_render.sources.render.transport.diffuse import DiffuseIntegrator
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.paths import PathIntegrator
@@ -105,7 +105,7 @@ class PacketTracer(Tracer):
         seed: int,
         responses: dict[str, Spectrum],
         progress: Callable[[int], None] | None = None,
-        block_rays: int = BLOCK_RAYS,
+        block_rays: int | None = None,
         light: Waveform | None = None,
     ) -> None:
         import drjit as dr

@@ -29,6 +29,9 @@ from hesim_render.sources.render.transport.moving_scene import Group
 _PARTS = 8
 #: Points along an edge that a lens with distortion images as a curve.
 _ALONG = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
+#: Period over which objects are sorted out that are never small, µs; instants at which their size is taken; and how
+#: many times the limit it must be at all of them.
+_SORTED_US, _INSTANTS, _FAR_FROM_SMALL = 64_000, 65, 4.0
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,7 @@ class Zoom:
         self._is_diffuse, self._tuning = is_diffuse, tuning
         # bands of rows ask for the same windows one after another, and so does the audit
         self._outlines = method_cache(self._outlines_in, maxsize=64)
+        self._large = method_cache(self._large_in, maxsize=64)
         geometry = view.sensor.spec.geometry
         left, right, top, bottom = (edge / (geometry.pitch_um * 1e-3) for edge in view.followed_mm)
         middle = np.array([geometry.cols / 2, geometry.rows / 2])
@@ -118,7 +122,11 @@ class Zoom:
         """
         by_size: dict[bool, list[tuple[float, SweptOutline]]] = {True: [], False: []}
         margin, tuning = self._tuning.zoom_margin_px, self._tuning
+        large = self._large_within(begin_us, end_us)
         for number, group in enumerate(self._groups):
+            # an asynchronous sensor and the audit ask for thousands of windows, and an outline takes a millisecond
+            if number in large:
+                continue
             outline = self._outline(number, group, begin_us, end_us)
             if outline is None or (self._is_diffuse and not outline.is_small):
                 continue
@@ -139,14 +147,54 @@ class Zoom:
                 looks.append(([outline for _, outline in entries[:some]], rays, is_small))
         return looks
 
+    def _large_within(self, begin_us: float, end_us: float) -> frozenset[int]:
+        """Numbers of objects that need no look in a window, because they are large throughout a longer period."""
+        period = int(begin_us // _SORTED_US)
+        if not self._is_diffuse or end_us > (period + 1) * _SORTED_US:
+            return frozenset()
+        return self._large(period)
+
+    def _large_in(self, period: int) -> frozenset[int]:
+        """Numbers of objects that are far from small at every instant of a period.
+
+        Between two instants an extent may change further than at them. It must therefore also exceed the limit by twice
+        its largest change from one instant to the next.
+        """
+        begin, end = period * _SORTED_US, (period + 1) * _SORTED_US
+        times, limit = np.linspace(begin, end, _INSTANTS), self._tuning.small_px
+        large = set()
+        for number, group in enumerate(self._groups):
+            poses = group.trajectory.matrix(times)
+            points = group.corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+            if self._camera is not None:  # in the frame of the camera, as the resting one would see it
+                moved = self._camera.matrix(times)
+                points = (points - moved[:, None, :3, 3]) @ moved[:, :3, :3]
+            extent = self._extents(points)  # [instant, column and row]
+            if not np.all(np.isfinite(extent)):
+                continue
+            room = extent.min() - 2 * np.abs(np.diff(extent, axis=0)).max()
+            if room > limit and extent.min() > _FAR_FROM_SMALL * limit:
+                # instants of an even step could miss a vibration, but not the keyframes between which it happens
+                seen = (self._extents(corners) for corners, _ in self._places(group, begin, end))
+                if min(float(each.min()) for each in seen) > _FAR_FROM_SMALL * limit:
+                    large.add(number)
+        return frozenset(large)
+
+    def _places(self, group: Group, begin_us: float, end_us: float) -> list[tuple[NDArray[np.float64], float]]:
+        """Corners of an object at successive instants, as the resting camera would see them; see `places`."""
+        if self._camera is None:
+            return places(group.corners, group.trajectory, begin_us, end_us)
+        return places_seen(group.corners, group.trajectory, self._camera, begin_us, end_us)
+
+    def _extents(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Extent of corners [k, n, 3] in the image, [k, 2], pixels."""
+        rest = np.broadcast_to(self._view.camera_to_world, (len(corners), 4, 4))
+        return np.ptp(self._view.project_on_sensor(corners, rest)[0], axis=1)
+
     def _outline(self, number: int, group: Group, begin_us: float, end_us: float) -> SweptOutline | None:
         """The area that an object sweeps; None outside the view."""
         points, extents, wider = [], [], 0.0
-        if self._camera is None:
-            pieces = places(group.corners, group.trajectory, begin_us, end_us)
-        else:
-            pieces = places_seen(group.corners, group.trajectory, self._camera, begin_us, end_us)
-        for corners, margin in pieces:
+        for corners, margin in self._places(group, begin_us, end_us):
             rest = np.broadcast_to(self._view.camera_to_world, (len(corners), 4, 4))
             seen, px_per_m = self._view.project_on_sensor(self._along_edges(corners), rest)
             points.append(seen.reshape(-1, 2))
@@ -205,10 +253,13 @@ class Zoom:
         looks, which = distinct_columns(times)
         chosen: list[Look] = []
         for look, (low, high) in enumerate(looks.T):
+            kinds = self._outlines(float(low), float(high))
+            if not kinds:
+                continue
             mine = np.flatnonzero(which == look)
             places = np.full(shape, -1)
             places[row[mine] - top, col[mine] - left] = mine
-            for outlines, rays, is_small in self._outlines(float(low), float(high)):
+            for outlines, rays, is_small in kinds:
                 chosen.extend(self._looks(outlines, rays, is_small, places, top, left))
         return chosen
 

@@ -76,7 +76,11 @@ def level_on_plane(
     normal: NDArray[np.float64],
     in_lux: bool,
 ) -> float:
-    """∫ L cos θ dω over the half sphere above a plane, lx or W m⁻² (360 to 830 nm): the sum over all texels of a map.
+    """∫ L cos θ dω over the half sphere above a plane, lx or W m⁻² (360 to 830 nm): the sum over a map.
+
+    Between four texels Mitsuba interpolates spectrum and scale apart, so their product is of the second degree along
+    each axis: two points of Gauss along each are exact. They also lie off the texels, where a GPU's rounding of places
+    would fetch the neighbours of the wrong cell.
 
     Parameters
     ----------
@@ -89,25 +93,32 @@ def level_on_plane(
     import drjit as dr
 
     rows, cols = shape
-    theta = np.linspace(0.0, np.pi, rows)
-    phi = 2 * np.pi * np.arange(cols) / cols
-    rows_at_once, total = max(1, _CHUNK // cols), 0.0
+    # two points in each cell between texels, as multiples of its size; texels lie on both poles, and half a column from
+    # the seam
+    points = (np.arange(max(rows - 1, cols))[:, None] + 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)).ravel()
+    theta, phi = points[: 2 * (rows - 1)] * np.pi / (rows - 1), (points[: 2 * cols] + 0.5) * 2 * np.pi / cols
+    rows_at_once, total = max(1, _CHUNK // phi.size), 0.0
     weight_nm = np.full(_WAVELENGTH_NM.size, _WAVELENGTH_NM[1] - _WAVELENGTH_NM[0])
     weight_nm[[0, -1]] /= 2
     if in_lux:
         weight_nm *= LUMINOUS_EFFICACY_LM_PER_W * photopic().at(_WAVELENGTH_NM)
-    for first in range(0, rows, rows_at_once):
-        polar, around = np.meshgrid(theta[first : first + rows_at_once], phi, indexing="ij")
-        own = np.stack([np.sin(around) * np.sin(polar), np.cos(polar), -np.cos(around) * np.sin(polar)])
-        direction = turn @ own.reshape(3, -1)
-        weight = np.maximum(normal @ direction, 0.0) * np.sin(polar).ravel()
+    for first in range(0, theta.size, rows_at_once):
+        polar = theta[first : first + rows_at_once, None]
+        own = np.broadcast_arrays(np.sin(phi) * np.sin(polar), np.cos(polar), -np.cos(phi) * np.sin(polar))
+        direction = turn @ np.stack(own).reshape(3, -1)
+        weight = np.maximum(normal @ direction, 0.0) * np.repeat(np.sin(polar), phi.size)
         seen = np.flatnonzero(weight > 0)
         if seen.size == 0:
             continue
         si = dr.zeros(mi.SurfaceInteraction3f, seen.size)
-        si.wi = mi.Vector3f(*(-direction[:, seen]).astype(np.float32))
+        si.wi = mi.Vector3f(*(-each[seen].astype(np.float32) for each in direction))
+        level = dr.zeros(mi.Float, seen.size)
+        # one kernel for all groups of four wavelengths, which leaves their sum on the device
         for wavelengths, weights in zip(_WAVELENGTH_NM.reshape(-1, 4), weight_nm.reshape(-1, 4), strict=True):
             si.wavelengths = type(si.wavelengths)([dr.opaque(mi.Float, float(one)) for one in wavelengths])
-            radiance = np.array(emitter.eval(si), dtype=np.float64).reshape(4, -1)
-            total += float((weights[:, None] * radiance * weight[seen]).sum())
-    return total * (np.pi / (rows - 1)) * (2 * np.pi / cols)
+            radiance = emitter.eval(si)
+            for band, one in enumerate(weights):
+                level += radiance[band] * dr.opaque(mi.Float, float(one))
+            dr.eval(level)
+        total += float(np.array(level, np.float64) @ weight[seen])
+    return total / 4 * (np.pi / (rows - 1)) * (2 * np.pi / cols)

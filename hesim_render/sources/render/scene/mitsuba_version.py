@@ -43,6 +43,7 @@ def mitsuba() -> MitsubaModule:
 
         if mi.variant() != wanted:
             mi.set_variant(wanted)
+        backend.set_compiler_flags()
     mi.set_log_level(mi.LogLevel.Error)
     resolver: Any = getattr(mi, "file_resolver")()  # noqa: B009 - the stubs declare it as an object
     if str(resolver[0]) != str(plugin_folder(mi)):

@@ -1,0 +1,108 @@
+"""Objects that get extra pilot rays: what is sorted out for a longer period is small in no window of it."""
+
+import numpy as np
+import pytest
+from rendering import make_scene, mono
+
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.windows import Windows
+
+CAMERA = {"origin_m": [0.1, 0, 2], "target_m": [0, 0, 0], "horizontal_fov_deg": 22.62}
+PERIOD_US = 64_000
+
+
+def flight(name, way, turn_deg, until_us=50_000, axis=(0, 1, 0)):
+    keys = [
+        {"t_us": 0, "translation_m": [-v for v in way], "rotation_axis": list(axis), "rotation_deg": -0.4 * turn_deg},
+        {"t_us": until_us, "translation_m": way, "rotation_axis": list(axis), "rotation_deg": 0.6 * turn_deg},
+    ]
+    return {"object": name, "pivot_m": [0.05, 0, 0], "keyframes": keys}
+
+
+def plate(name, size, **more):
+    return {"name": name, "shape": "rectangle", "size_m": [*size, 0], "reflectance": 0.4, **more}
+
+
+def zoom_of(objects, motion):
+    light = {"type": "uniform", "illuminance_lux": 300}
+    scene = make_scene(objects=objects, light=light, camera=CAMERA, motion=motion)
+    return ChangeDrivenFlux(scene, mono(320, 240), seed=3)._renderer.zoom
+
+
+def swarm(rng, count=12):
+    objects, motion = [], []
+    for k in range(count):
+        size = 10 ** rng.uniform(-2.2, -0.2, 3)
+        shape = ("sphere", "box", "rectangle")[k % 3]
+        dims = {"sphere": [size[0]] * 3, "box": size.tolist(), "rectangle": [size[0], size[1], 0.0]}[shape]
+        objects.append({"name": f"o{k}", "shape": shape, "size_m": dims, "reflectance": 0.3,
+                        "position_m": rng.uniform(-0.3, 0.3, 3).tolist()})  # fmt: skip
+        way, turn = (rng.normal(size=3) * 0.2).tolist(), float(rng.choice([0, 3, 40, 300]))
+        motion.append(flight(f"o{k}", way, turn, int(rng.choice([7_000, 30_000, 64_000])), rng.normal(size=3).tolist()))
+    return objects, motion
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("rides", [False, True])
+def test_what_is_called_large_is_small_in_no_window(seed, rides):
+    objects, motion = swarm(np.random.default_rng(seed))
+    if rides:
+        motion.append({**flight("camera", [0.15, 0.02, -0.3], 6.0, 40_000), "object": "camera"})
+    zoom = zoom_of(objects, motion)
+    rng, called = np.random.default_rng(seed + 50), 0
+    for period in (0, 1):
+        large = zoom._large(period)
+        called += len(large)
+        begins = np.sort(rng.uniform(period * PERIOD_US, (period + 1) * PERIOD_US - 900, 150))
+        for number in large:
+            for begin in begins:
+                outline = zoom._outline(number, zoom._groups[number], begin, begin + rng.choice([0.0, 37.0, 900.0]))
+                assert outline is None or not outline.is_small
+    assert 2 <= called < 22
+
+
+@pytest.mark.parametrize(("name", "way", "turn"), [("swings", [0.0, 0.0, 0.0], 170.0), ("passes", [0.5, 0, 0], 0.0)])
+def test_a_plate_that_is_seen_edge_on_for_a_moment_is_not_large(name, way, turn):
+    """One turns, the other goes by the camera, which sees first its left and then its right face."""
+    rotation = {} if turn else {"rotation_axis": [0, 1, 0], "rotation_deg": 90}
+    zoom = zoom_of([plate(name, (0.9, 0.5), **rotation)], [flight(name, way, turn)])
+    assert zoom._large(0) == frozenset()
+    still = zoom_of([plate(name, (0.9, 0.5))], [flight(name, [0.1, 0.02, 0], 2.0)])
+    assert still._large(0) == frozenset({0})
+
+
+def test_extra_looks_are_those_without_the_short_cut(monkeypatch):
+    objects, motion = swarm(np.random.default_rng(8))
+    speck = {
+        "name": "speck",
+        "shape": "sphere",
+        "size_m": [0.012] * 3,
+        "position_m": [0.05, 0.03, 0],
+        "reflectance": 0.6,
+    }
+    objects, motion = [*objects, speck], [*motion, flight("speck", [0.1, -0.02, 0], 0.0)]
+    zoom = zoom_of(objects, motion)
+    sensor = zoom._view.sensor
+    row, col = np.divmod(sensor.layout.full_index.ravel()[::3].astype(np.int64), sensor.spec.geometry.cols)
+    windows = Windows(np.array([1000.0, 30_500.0, 63_900.0]), np.array([1450.0, 31_000.0, 64_100.0]))
+    numbers = np.broadcast_to(np.arange(3)[:, None], (3, row.size))
+    looks = zoom.sites(row, col, windows, numbers)
+    assert sum(map(len, looks)) > 0
+    plain = zoom_of(objects, motion)
+    monkeypatch.setattr(type(plain), "_large_within", lambda *_: frozenset())
+    for ours, all_ in zip(looks, plain.sites(row, col, windows, numbers), strict=True):
+        assert len(ours) == len(all_)
+        for one, other in zip(ours, all_, strict=True):
+            assert (one.rays, one.is_small) == (other.rays, other.is_small)
+            np.testing.assert_array_equal(one.place, other.place)
+
+
+def test_glossy_scenes_and_windows_across_periods_take_no_short_cut():
+    body = {"name": "card", "shape": "box", "size_m": [0.5, 0.4, 0.3], "position_m": [0, 0, 0]}
+    shiny = {**body, "reflectance": 0.4}
+    motion = [flight("card", [0.05, 0.02, 0], 2.0)]
+    matt = zoom_of([shiny], motion)
+    assert matt._large_within(10, 900) == frozenset({0})
+    assert matt._large_within(63_900, 64_100) == frozenset()
+    matt._is_diffuse = False
+    assert matt._large_within(10, 900) == frozenset()
