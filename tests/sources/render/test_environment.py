@@ -53,7 +53,7 @@ def test_the_level_is_the_one_asked_for(tmp_path, rotation_deg):
 
 
 def test_black_texels_dim_their_neighbours_as_in_mitsuba(tmp_path):
-    """Half of the texels are black. Spectrum and scale are interpolated apart, so the sky has 4 % less than their mean."""
+    """Half of the texels are black. Spectrum and scale are interpolated apart: the sky has 4 % less than their mean."""
     write_map(tmp_path, (1.3 + np.cos(THETA)) * (np.random.default_rng(7).random((ROWS, COLS)) > 0.5))
     expected = flux(tmp_path, {"type": "uniform", "illuminance_lux": 500}, samples=64)
     light = {"type": "environment", "file": "map.exr", "illuminance_lux": 500, "rotation_deg": 20}
