@@ -155,10 +155,13 @@ def test_the_scatter_of_a_pilot_has_no_range(power):
     types, rng = jit(), np.random.default_rng(3)
     two_kinds, one_bright = np.repeat([5.0, 3.0], 16) + rng.normal(size=32), np.where(np.arange(32) == 7, 900.0, 0.25)
     rays = np.stack([two_kinds, one_bright])
-    flux, met = (types.Float(np.ldexp(rays, power).ravel().astype(np.float32)), types.UInt32(np.zeros(64, np.uint32)))
+    flux = types.Float(np.ldexp(rays, power).ravel().astype(np.float32))
+    met = types.UInt32((np.arange(64) == 53).astype(np.uint32))  # a single ray of the second pair
     out = PilotFlux.empty(2)
     with np.errstate(all="raise"):
-        out.put(slice(0, 2), flux, 2 * flux, flux, met, 32, 16)
+        out.put(slice(0, 2), flux, 2 * flux, 3 * flux, met, 32, 16)
+    assert out.met.tolist() == [False, True]
+    np.testing.assert_allclose(np.ldexp(out.unshadowed.astype(np.float64), -power), 3 * rays.mean(axis=1), rtol=1e-5)
     deviation = rays.reshape(2, 2, 16) - rays.reshape(2, 2, 16).mean(axis=2, keepdims=True)
     expected = np.sqrt((deviation**4).sum(axis=(1, 2)) / (deviation**2).sum(axis=(1, 2)) * 16 / 15)
     np.testing.assert_allclose(np.ldexp(out.controlled_scatter.astype(np.float64), -power), expected, rtol=1e-5)
@@ -176,11 +179,11 @@ def test_a_pilot_says_how_much_single_rays_change():
     pairs = np.array([2, 0])
     some = [types.Float(np.array(values).reshape(3, 16)[pairs].ravel()) for values in fluxes[:2]]
     met = types.UInt32(np.zeros(32, np.uint32))
-    out.put(slice(0, 2), *some, some[0], met, 16, 16, rays.at(pairs))
+    out.put(slice(0, 2), *some, some[0], met, 16, 16, (rays, pairs))
     for found, difference in ((out.controlled_change, now - before), (out.plain_change, 0.5 * now - 0.3 * before)):
         np.testing.assert_allclose(found, difference[pairs].std(axis=1, ddof=1), rtol=1e-4)
     every = PilotFlux.empty(3)
-    every.put(slice(0, 3), *fluxes[:2], fluxes[0], types.UInt32(np.zeros(48, np.uint32)), 16, 16, rays.at(np.arange(3)))
+    every.put(slice(0, 3), *fluxes[:2], fluxes[0], types.UInt32(np.zeros(48, np.uint32)), 16, 16, (rays, np.arange(3)))
     assert every.controlled_change[1] < 0.05 and every.controlled_change[0] > 500
 
 

@@ -71,6 +71,26 @@ def test_a_plate_that_is_seen_edge_on_for_a_moment_is_not_large(name, way, turn)
     assert still._large(0) == frozenset({0})
 
 
+def test_a_vibration_between_the_instants_is_seen():
+    """It turns by 88° and back in the millisecond between two of them."""
+    keys = [{"t_us": 500 * k, "rotation_axis": [0, 1, 0], "rotation_deg": 88.0 * (k % 2)} for k in range(3)]
+    motion = [{"object": "p", "repeat": True, "pivot_m": [0.1, 0, 0], "keyframes": keys}]
+    ahead = plate("p", (0.9, 0.5), position_m=[0.1, 0, 0])  # of the camera, which sees its edge at 90°
+    assert zoom_of([ahead], motion)._large(0) == frozenset()
+
+
+@pytest.mark.parametrize("who", ["camera", "p"])
+def test_what_becomes_small_from_afar_is_large_before(who):
+    """The camera or the plate goes 14 m back in the second period; the other one hardly moves."""
+    back = 14.0 if who == "camera" else -14.0
+    keys = [{"t_us": t, "translation_m": [0, 0, z]} for t, z in ((0, 0.0), (PERIOD_US, 0.001), (2 * PERIOD_US, back))]
+    motion = [{"object": who, "keyframes": keys}]
+    if who == "camera":
+        motion.append(flight("p", [0.001, 0, 0], 0.0))
+    zoom = zoom_of([plate("p", (0.2, 0.16))], motion)
+    assert zoom._large(0) == frozenset({0}) and zoom._large(1) == frozenset()
+
+
 def test_extra_looks_are_those_without_the_short_cut(monkeypatch):
     objects, motion = swarm(np.random.default_rng(8))
     speck = {

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.journal import Journal, key_of
-from hesim_render.core.tables import spread_out
 from hesim_render.sources.render.change_driven.aim import PairAims
 from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
+from hesim_render.sources.render.change_driven.ray_statistics import RayStatistics
 from hesim_render.sources.render.change_driven.windows import Windows
 
 
@@ -108,7 +108,7 @@ class PilotFlux:
         met: UInt32,
         samples: int,
         alike: int,
-        before: tuple[Float, Float] | None = None,
+        before: tuple[PilotRays, NDArray[np.integer]] | None = None,
     ) -> None:
         """Put in the statistics of pairs.
 
@@ -118,41 +118,25 @@ class PilotFlux:
         controlled, plain, unshadowed, met : of each ray, one pair after the other; `met` is 1 where the ray came near a
             moving object.
         samples : number of rays of each pair.
-        alike : number of successive rays that are of one kind. Scatter is that within each kind.
-        before : `controlled` and `plain` of the same rays in the window to compare with; None where there is none.
+        alike : number of successive rays that are of one kind, all or half of them. Scatter is that within each kind.
+        before : the same rays in other windows, and [n] the pair among them to compare each pair with; None where there
+            is none.
         """
         import drjit as dr
 
-        types = jit()
-        ray = dr.arange(types.UInt32, len(met))
-        kind, pair = ray // dr.opaque(types.UInt32, alike), ray // dr.opaque(types.UInt32, samples)
-        share, unbiased = dr.opaque(types.Float, 1 / samples), dr.opaque(types.Float, alike / (alike - 1))
-        per_share = dr.opaque(types.Float, 1 / alike)
+        types, rays = jit(), RayStatistics(len(met) // samples, samples, alike)
+        dr.eval(controlled, plain, unshadowed, met)
+        found: dict[str, Float | UInt32] = {"unshadowed": rays.mean(unshadowed), "met": rays.any_bits(met)}
         for values, name in ((controlled, "controlled"), (plain, "plain")):
-            mean = dr.block_sum(values, samples) * share
-            # about the mean of each kind: what differs between kinds is no scatter
-            own = dr.block_sum(values, alike) * per_share
-            deviation = values - dr.gather(types.Float, own, kind)
-            # relative to the largest one, as fourth powers of fluxes leave the range of float32
-            unit = power_below(dr.block_reduce(dr.ReduceOp.Max, dr.abs(deviation), samples))
-            square = dr.square(deviation * dr.gather(types.Float, 1 / unit, pair))
-            fourth, second = dr.block_sum(square * square, samples), dr.block_sum(square, samples)
-            # these rays are a sample of the scatter in the scene
-            scatter = unit * dr.sqrt(dr.select(second > 0, fourth / second, 0.0) * unbiased)
-            dr.eval(mean, scatter)
-            getattr(self, name)[part], getattr(self, f"{name}_scatter")[part] = np.array(mean), np.array(scatter)
-        for values, other, name in zip(
-            (controlled, plain), before or (), ("controlled_change", "plain_change"), strict=False
-        ):
-            # the same rays in both windows: what they have in common drops out
-            difference = values - other
-            mean = dr.block_sum(difference, samples) * share
-            deviation = difference - dr.gather(types.Float, mean, pair)
-            unit = power_below(dr.block_reduce(dr.ReduceOp.Max, dr.abs(deviation), samples))
-            square = dr.square(deviation * dr.gather(types.Float, 1 / unit, pair))
-            getattr(self, name)[part] = np.array(unit * dr.sqrt(dr.block_sum(square, samples) * (share * unbiased)))
-        self.unshadowed[part] = np.array(dr.block_sum(unshadowed, samples) * share)
-        self.met[part] = np.array(dr.block_reduce(dr.ReduceOp.Or, met, samples))
+            found[name], found[f"{name}_scatter"] = rays.mean_and_scatter(values)
+        if before is not None:
+            others, pair = before
+            first = types.UInt32(pair.astype(np.uint32)) * dr.opaque(types.UInt32, samples)
+            for values, other, name in ((controlled, others.controlled, "controlled"), (plain, others.plain, "plain")):
+                found[f"{name}_change"] = rays.change(values, other, first)
+        dr.eval(*found.values())
+        for name, each in found.items():
+            getattr(self, name)[part] = np.array(each)
 
 
 def not_negative(flux: PairFlux) -> None:
@@ -181,17 +165,6 @@ class PilotRays:
     samples: int
     spans_us: tuple[float, ...]
 
-    def at(self, pair: NDArray[np.integer]) -> tuple[Float, Float]:
-        """Fluxes of the rays of some pairs."""
-        import drjit as dr
-
-        types = jit()
-        ray = dr.arange(types.UInt32, pair.size * self.samples)
-        which = ray // dr.opaque(types.UInt32, self.samples)
-        place = spread_out(types.UInt32, pair.astype(np.uint32), which) * dr.opaque(types.UInt32, self.samples)
-        place += ray - which * dr.opaque(types.UInt32, self.samples)
-        return dr.gather(types.Float, self.controlled, place), dr.gather(types.Float, self.plain, place)
-
 
 def joined(first: PilotRays, second: PilotRays) -> PilotRays:
     """Rays of two lists of pairs, one after the other."""
@@ -201,16 +174,6 @@ def joined(first: PilotRays, second: PilotRays) -> PilotRays:
         dr.concat([getattr(each, name) for each in (first, second)]) for name in ("controlled", "plain")
     )
     return PilotRays(controlled, plain, first.samples, first.spans_us + second.spans_us)
-
-
-def power_below(values: Float) -> Float:
-    """The powers of two not above positive values; dividing by them rounds nothing. Of 0 it is the least normal one."""
-    import drjit as dr
-
-    types = jit()
-    exponent = dr.reinterpret_array(types.UInt32, values) & types.UInt32(0x7F800000)
-    power: Float = dr.reinterpret_array(types.Float, exponent)
-    return dr.maximum(power, 2.0**-120)
 
 
 def remembered(

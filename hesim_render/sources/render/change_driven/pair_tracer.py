@@ -306,8 +306,7 @@ class PairTracer(PacketTracer):
         # all rays belong to the first half
         traced = self._packets_of(lanes, packets, packets * PACKET, moments, key, footprint, aims).fluxes
         # rays that are aimed are a kind of their own: their mean differs from that of the others
-        compared = None if before is None else before[0].at(before[1])
-        out.put(part, *traced, samples, samples if aims is None else samples // 2, compared)
+        out.put(part, *traced, samples, samples if aims is None else samples // 2, before)
         if kept is not None:
             for values, flux in zip(kept, traced[:2], strict=True):
                 values[part.start * samples : part.stop * samples] = np.array(flux)

@@ -30,7 +30,7 @@ _PARTS = 8
 #: Points along an edge that a lens with distortion images as a curve.
 _ALONG = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
 #: Period over which objects are sorted out that are never small, µs; instants at which their size is taken; and how
-#: many times the limit it must be at all of them.
+#: many times the limit it must be at keyframes.
 _SORTED_US, _INSTANTS, _FAR_FROM_SMALL = 64_000, 65, 4.0
 
 
@@ -173,7 +173,7 @@ class Zoom:
             if not np.all(np.isfinite(extent)):
                 continue
             room = extent.min() - 2 * np.abs(np.diff(extent, axis=0)).max()
-            if room > limit and extent.min() > _FAR_FROM_SMALL * limit:
+            if room > limit:
                 # instants of an even step could miss a vibration, but not the keyframes between which it happens
                 seen = (self._extents(corners) for corners, _ in self._places(group, begin, end))
                 if min(float(each.min()) for each in seen) > _FAR_FROM_SMALL * limit:
