@@ -126,16 +126,16 @@ class PilotFlux:
 
         types, rays = jit(), RayStatistics(len(met) // samples, samples, alike)
         dr.eval(controlled, plain, unshadowed, met)
-        found: dict[str, Float | UInt32] = {"unshadowed": rays.mean(unshadowed), "met": rays.any_bits(met)}
+        results: dict[str, Float | UInt32] = {"unshadowed": rays.mean(unshadowed), "met": rays.any_bits(met)}
         for values, name in ((controlled, "controlled"), (plain, "plain")):
-            found[name], found[f"{name}_scatter"] = rays.mean_and_scatter(values)
+            results[name], results[f"{name}_scatter"] = rays.mean_and_scatter(values)
         if before is not None:
             others, pair = before
             first = types.UInt32(pair.astype(np.uint32)) * dr.opaque(types.UInt32, samples)
             for values, other, name in ((controlled, others.controlled, "controlled"), (plain, others.plain, "plain")):
-                found[f"{name}_change"] = rays.change(values, other, first)
-        dr.eval(*found.values())
-        for name, each in found.items():
+                results[f"{name}_change"] = rays.change(values, other, first)
+        dr.eval(*results.values())
+        for name, each in results.items():
             getattr(self, name)[part] = np.array(each)
 
 
