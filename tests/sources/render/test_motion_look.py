@@ -115,6 +115,11 @@ def test_figures_in_words_say_what_is_lost(found):
     moving, events, size = motion_lines(figures, sensor, DURATION_US)
     assert moving == f"{found.moving:.0%} of the picture moves, at up to 300 px/s: 0.6 px in an exposure of 2 ms"
     assert "(the read-out takes 5000/s: EVENTS WILL BE LOST)" in events and "0.05 s" in size
+    large = figures | {"speed_px_per_s": 36_437.0, "blur_px": 364.4, "events_per_s": 94_700.0,
+                       "busy_events_per_s": 12_340_000.0, "events": 5_040_000.0, "bytes": 2.14e9}  # fmt: skip
+    moving, events, size = motion_lines(large, sensor, DURATION_US)
+    assert "up to 36400 px/s: 360 px" in moving and "about 95000/s, 90 % of the time below 12 million/s" in events
+    assert "has about 2100 MB: 2 frames and 5000000 events" in size
     with pytest.raises(RangeError, match=r"look is 0.06; expected 0 to 0.05 s, within the run"):
         motion_look(sliding(), sensor, 60_000.0, DURATION_US)
 
