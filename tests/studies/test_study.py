@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+import re
 from html.parser import HTMLParser
 
 import numpy as np
@@ -442,6 +443,17 @@ def test_a_set_whose_white_clips_has_a_hollow_marker():
             for clips in (True, False)
         ]
     assert "stroke-width: 1.5" in drawn[0] and "stroke-width: 1.5" not in drawn[1]
+
+
+def test_names_of_sets_are_not_cut_off_below_a_plot():
+    """The legend has fewer columns where the names are long, and the figure is higher by its lines."""
+    sizes = []
+    for more in ("", " of many pixels", " which has a name that two columns cannot hold at all"):
+        with report_style():
+            named = ({**row, "filter_set": row["filter_set"] + more, "crosstalk": 0.0} for row in ranked())
+            page = pareto_plot(Table(named), "t")
+        sizes.append(float(re.search(r'viewBox="0 0 [\d.]+ ([\d.]+)"', page).group(1)))
+    assert np.diff(sizes).tolist() == [16, 16]
 
 
 def ranked(**changes):
