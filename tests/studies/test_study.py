@@ -448,7 +448,7 @@ def test_a_set_whose_white_clips_has_a_hollow_marker():
 def test_names_of_sets_are_not_cut_off_below_a_plot():
     """The legend has fewer columns where the names are long, and the figure is higher by its lines."""
     sizes = []
-    for more in ("", " of many pixels", " which has a name that two columns cannot hold at all"):
+    for more in ("", " of many pixels and sizes", " which has a name that two columns cannot hold at all"):
         with report_style():
             named = ({**row, "filter_set": row["filter_set"] + more, "crosstalk": 0.0} for row in ranked())
             page = pareto_plot(Table(named), "t")
