@@ -15,8 +15,6 @@ _RANKED, _COST = "ysnr_noise_aware", "delta_e_mean_noise_aware"
 _OWN = ("filter_set", "sensor", "crosstalk")
 #: Candidates that a sentence names; the tables have the others.
 _MOST_NAMED = 6
-#: Key of a study that gives its figures intervals.
-_WANTED = "noise: {repeats: 8}"
 #: A cost within this part of the least one is no cost.
 _ALIKE = 0.05
 #: Figures of a design without an interval that differ by no more than this part count as equal.
@@ -117,7 +115,7 @@ def _sentence(rows: Table, own: Sequence[str]) -> str | None:
     if len(ranked) > _MOST_NAMED:
         order += f", and {len(ranked) - _MOST_NAMED} more"
     if len(named) > 1 and not all(one.has_interval for one in named):
-        order += f", with no intervals to judge the differences by ({_WANTED} makes them)"
+        order += " (no intervals to judge the differences by)"
     text = f"noise-aware YSNR {order}"
     known = [(one.cost, one) for one in ranked if one.cost is not None]
     if known:
