@@ -17,8 +17,8 @@ ROOT = Path(__file__).parents[1]
 PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
 #: Keys of cited works in brackets, as in [kirk1991] or [salmon2011, wellons2018].
 CITED = re.compile(r"(?<!\])\[([a-z]+\d{4}[a-z]?(?:, [a-z]+\d{4}[a-z]?)*)\](?![(\[])")
-#: A symbol of one letter with an index.
-INDEXED = re.compile(r"(?<![\w/.:])([A-Za-zΔΘΛΣΦΨΩαβγδηθκλμνρσςτφχψωϱ])_([A-Za-z0-9]+)(?![A-Za-z0-9_/])")
+#: A symbol of one letter, with a hat or without, and an index.
+INDEXED = re.compile(r"(?<![\w/.:])([A-Za-zΔΘΛΣΦΨΩαβγδηθκλμνρσςτφχψωϱ]\u0302?)_([A-Za-z0-9]+)(?![A-Za-z0-9_/])")
 #: Characters of a cell from which a table does not fit on a telephone.
 LONG_CELL = 40
 #: Letters of a word that is a key: the column beside it would be too narrow on a telephone.

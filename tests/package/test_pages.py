@@ -117,6 +117,8 @@ def test_the_site_does_not_cut_options_and_short_names():
     assert "<code>tests/package/a_test_of_many_words.py<" in shown
     assert "</span><span class=whole>--out</span><span" in shown and "<span class=whole>b<" not in shown
     assert hooks["plain_text"](shown) == hooks["plain_text"](page)
+    symbols = hooks["INDEXED"].sub(r"\1<sub>\2</sub>", "Φ\u0302_a f_c, but a/b_c and name_of")
+    assert symbols == "Φ\u0302<sub>a</sub> f<sub>c</sub>, but a/b_c and name_of"
 
 
 def test_no_link_is_named_after_its_file():
