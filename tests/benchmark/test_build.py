@@ -482,7 +482,10 @@ def test_axes_of_alike_clips_have_numbers_that_do_not_overlap():
     assert _own_ticks(np.array([3.0, 5.0, 4.0])) == pytest.approx([15**0.5])
     one = {"figures": dict.fromkeys(("brightness_e_per_s", "contrast", "activity_hz", "speed_widths_per_s"), 1.7)}
     with Image.open(io.BytesIO(histograms([one]))) as picture:
-        below = np.asarray(picture.convert("L"))[216:240] < 128  # numbers on the four axes
+        shades = np.asarray(picture.convert("L"))
+    left = shades[:200, 24:36] < 128  # numbers of clips beside the first axis: 0 and 1
+    assert np.count_nonzero(np.diff(left.any(axis=1).astype(int)) == 1) == 1
+    below = shades[216:240] < 128  # numbers on the four axes
     assert 4 <= np.count_nonzero(np.diff(below.any(axis=0).astype(int)) == 1) <= 24
 
 

@@ -452,6 +452,7 @@ def test_names_of_sets_are_not_cut_off_below_a_plot():
         with report_style():
             named = ({**row, "filter_set": row["filter_set"] + more, "crosstalk": 0.0} for row in ranked())
             page = pareto_plot(Table(named), "t")
+        assert page.count(f">ryyb{more}<") == 1
         sizes.append(float(re.search(r'viewBox="0 0 [\d.]+ ([\d.]+)"', page).group(1)))
     assert np.diff(sizes).tolist() == [16, 16]
 

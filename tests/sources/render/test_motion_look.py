@@ -59,19 +59,22 @@ def test_a_sliding_card_gives_the_events_of_its_two_edges(found):
     np.testing.assert_allclose([middle, found.picture[2, 3]], [[CARD] * 3, [WALL] * 3], rtol=0.01)
 
 
-def test_the_sky_is_as_bright_as_the_light_from_everywhere():
+def test_the_sky_is_as_bright_as_the_light_from_everywhere(tmp_path):
     """Over that of a white card: its part of the level of all lights, in lux."""
     everywhere = {"type": "uniform", "illuminant": "A", "illuminance_lux": 330}
     lamp = {"type": "point", "position_m": [1, 2, 3], "illuminant": "D65", "illuminance_lux": 550}
     in_watts = {"type": "directional", "direction": [0, 0, -1], "illuminant": "E", "irradiance_w_m2": 4.0}
     card = {"name": "card", "shape": "rectangle", "size_m": [0.4, 0.4, 0], "reflectance": CARD}
     camera = {"origin_m": [0, 0, 12], "target_m": [0, 0, 0], "horizontal_fov_deg": 4}
+    Image.new("RGB", (4, 2), (90, 90, 90)).save(tmp_path / "sky.png")
+    around = {"type": "environment", "file": str(tmp_path / "sky.png"), "illuminance_lux": 200}
     watts_lux = illuminance_lux(scale_to_irradiance(illuminant("E"), 4.0))
     for lights, wanted in (
         ([everywhere], 1),
         ([lamp], 0),
         ([everywhere, lamp], 330 / 880),
         ([lamp, in_watts, everywhere], 330 / (880 + watts_lux)),
+        ([lamp, around], 200 / 750),
         ([{"type": "none"}], 0),
     ):
         scene = rendering.make_scene(objects=[card], light=lights, camera=camera)
