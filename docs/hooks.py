@@ -17,14 +17,14 @@ ROOT = Path(__file__).parents[1]
 PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
 #: Keys of cited works in brackets, as in [kirk1991] or [salmon2011, wellons2018].
 CITED = re.compile(r"(?<!\])\[([a-z]+\d{4}[a-z]?(?:, [a-z]+\d{4}[a-z]?)*)\](?![(\[])")
-#: A symbol of one letter with an index.
-INDEXED = re.compile(r"(?<![\w/.:])([A-Za-zΔΘΛΣΦΨΩαβγδηθκλμνρσςτφχψωϱ])_([A-Za-z0-9]+)(?![A-Za-z0-9_/])")
+#: A symbol of one letter, with a hat or without, and an index.
+INDEXED = re.compile(r"(?<![\w/.:])([A-Za-zΔΘΛΣΦΨΩαβγδηθκλμνρσςτφχψωϱ]\u0302?)_([A-Za-z0-9]+)(?![A-Za-z0-9_/])")
 #: Characters of a cell from which a table does not fit on a telephone.
 LONG_CELL = 40
 #: Letters of a word that is a key: the column beside it would be too narrow on a telephone.
 LONG_WORD = 18
-#: A word of code with a hyphen, at which a browser would cut it.
-SHORT_HYPHENED = re.compile(r"(?<![^ ])(?=[^ ]*-)[^ ]{2,%d}(?![^ ])" % LONG_WORD)
+#: A word of code with a hyphen, or the path of a file, at whose signs a browser would cut it.
+CUT_CODE = re.compile(r"(?<![^ ])(?:(?=[^ ]*-)[^ ]{2,%d}|(?=[\w.]+/)[\w./-]{2,32})(?![^ ])" % LONG_WORD)
 #: The same in a block of commands, between what marks the spaces.
 OPTION = re.compile(r"(?<=[\s>])(?=[\w-]*-)[\w-]{2,24}(?=[\s<])")
 #: A match that is not cut at the end of a line.
@@ -127,11 +127,11 @@ def on_page_content(html: str, **_: Any) -> str:
 
 
 def whole_words(code: re.Match) -> str:
-    """Code in a line of text whose short words are not cut: neither ``--roi`` at its hyphens nor a name in a table."""
+    """Code in a line of text whose short words are not cut: ``--roi`` at its hyphens, a path, or a name in a table."""
     text = code.group(1)
     if len(text) <= LONG_WORD:
         return f"<code class=whole>{text}</code>"
-    return "<code>" + SHORT_HYPHENED.sub(WHOLE, text) + "</code>"
+    return "<code>" + CUT_CODE.sub(WHOLE, text) + "</code>"
 
 
 def plain_text(html: str) -> str:

@@ -50,7 +50,7 @@ def linear_video(scene, illuminant):
     for number in range(3):
         sensor = observer(number)
         flux = RenderedFlux(scene, sensor, SAMPLES, seed=7)
-        level = white_flux(flux.sensor, ["red"], light, LUX)[0]
+        level = white_flux(flux.sensor, ["curve"], light, LUX)[0]
         for k in range(len(xyz)):
             edges = np.array([k, k + 1]) * 1e6 / FPS
             cuts = np.concatenate([edges[:1], flux.slice_edges_us(*edges), edges[1:]])

@@ -21,8 +21,8 @@ PICTURES = {
 for name, source in PICTURES.items():
     picture = Image.open(FOLDER / source).convert("RGB")
     picture.thumbnail((1100, 1100))
-    if name.endswith(".png"):  # drawings: a palette keeps lines sharp and the file small
-        picture.quantize(64).save(OUT / name, optimize=True)
+    if name.endswith(".png"):  # drawings: a palette keeps lines sharp, and this one their colours
+        picture.quantize(128, method=Image.Quantize.FASTOCTREE).save(OUT / name, optimize=True)
     else:
         picture.save(OUT / name, quality=82, optimize=True)
     print(f"{OUT / name}: {(OUT / name).stat().st_size // 1000} kB")

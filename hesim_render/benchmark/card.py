@@ -52,6 +52,14 @@ def spread(clips: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     return result
 
 
+def _own_ticks(values: np.ndarray) -> list[float]:
+    """Numbers on an axis that spans too few powers of ten to be told by them; none where it spans two or more."""
+    low, high = float(values.min()), float(values.max())
+    if high >= 100 * low:
+        return []
+    return [low, high] if high > 2 * low else [float(np.sqrt(low * high))]
+
+
 def histograms(clips: list[dict[str, Any]]) -> bytes:
     """A PNG of the histograms of all figures over the clips, with logarithmic axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -66,8 +74,13 @@ def histograms(clips: list[dict[str, Any]]) -> bytes:
             low, high = values.min() / 1.1, values.max() * 1.1
             axes.hist(values, bins=np.geomspace(low, high, _BINS), color="0.35")
             axes.set_xscale("log")
+            ticks = _own_ticks(values)
+            if ticks:
+                axes.set_xticks(ticks, [f"{tick:.3g}" for tick in ticks])
+                axes.xaxis.set_minor_formatter("")
         axes.set_xlabel(name)
         axes.set_ylabel("clips")
+        axes.yaxis.get_major_locator().set_params(integer=True)
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()

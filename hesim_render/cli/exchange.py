@@ -91,7 +91,9 @@ def import_(
     out: Annotated[Path, typer.Option(help="HDF5 file to write; with --sensor the folder of the recording")],
     format: Annotated[
         str | None,
-        typer.Option(help="of the file, such as evt3; default: as the file states", autocompletion=_complete_import),
+        typer.Option(
+            help="of the event file, such as evt3; default: as the file states", autocompletion=_complete_import
+        ),
     ] = None,
     size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of the sensor, if the file does not state it")] = None,
     sensor: Annotated[
@@ -138,8 +140,8 @@ def import_(
              "event_grid": {"width": cols, "height": rows}},
         )  # fmt: skip
         return
-    if size is not None or format is not None:
-        raise ConflictError("--sensor", sensor, "give --sensor or --size and --format, not both")
+    if size is not None:
+        raise ConflictError("--size", size, "with --sensor, the size is that of the sensor; --roi takes a part of it")
     events = [file for file in sources if is_event_file(file)]
     frames = [file for file in sources if file not in events]
     if len(events) > 1:
@@ -150,7 +152,7 @@ def import_(
 
     loaded = cropped(hr.load_sensor(sensor), roi)
     made = import_recording(
-        out, loaded, events=events[0] if events else None, frames=frames, trigger_channel=trigger_channel,
-        from_zero=from_zero, overwrite=overwrite,
+        out, loaded, events=events[0] if events else None, frames=frames, format=format,
+        trigger_channel=trigger_channel, from_zero=from_zero, overwrite=overwrite,
     )  # fmt: skip
     show_recording(console, made)

@@ -82,12 +82,28 @@ def points(axes: Axes, x: NDArray, y: NDArray, colour: str, label: str = "", siz
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
-    """Legend of the labelled artists below the axes, where it covers nothing; the figure grows by its height."""
+    """Legend of the labelled artists below the axes, where it covers nothing; the figure grows by its height.
+
+    Parameters
+    ----------
+    figure : to which the legend is added.
+    axes : of the artists.
+    columns : of the legend; fewer where the names are too long for the width of the figure.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     handles, labels = axes.get_legend_handles_labels()
-    lines = -(-len(labels) // columns)
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    for fitting in range(columns, 0, -1):
+        legend = figure.legend(
+            handles, labels, loc="outside lower center", ncols=fitting, frameon=False, handlelength=1.2,
+            columnspacing=1.2, handletextpad=0.4, borderpad=0.2, labelspacing=0.2, markerscale=1.8,
+        )  # fmt: skip
+        if fitting == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
+            break
+        legend.remove()
+    lines = -(-len(labels) // fitting)
     figure.set_figheight(figure.get_figheight() + lines * _LEGEND_LINE / _PER_INCH)
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, handlelength=1.2,
-                  columnspacing=1.2, handletextpad=0.4, borderpad=0.2, labelspacing=0.2, markerscale=1.8)  # fmt: skip
 
 
 def picture(title: str, values: NDArray, unit: str, size_px: int = 400) -> Markup:

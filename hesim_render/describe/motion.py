@@ -97,10 +97,13 @@ def _bar(figure: Figure, axes: Axes, drawn: ScalarMappable, label: str) -> None:
     bar.ax.yaxis.set_minor_formatter(NullFormatter())
 
 
+def _rounded(value: float, digits: int = 2) -> str:
+    """A number of so many digits, never as a power of ten."""
+    return f"{float(f'{value:.{digits}g}'):.15g}"
+
+
 def _rate(rate_hz: float) -> str:
-    if rate_hz >= 1e5:
-        return f"{rate_hz / 1e6:.2g} million/s"
-    return f"{float(f'{rate_hz:.2g}'):g}/s"
+    return f"{_rounded(rate_hz / 1e6)} million/s" if rate_hz >= 1e5 else f"{_rounded(rate_hz)}/s"
 
 
 def motion_figures(look: MotionLook, sensor: Sensor, duration_us: int) -> dict[str, float | None]:
@@ -143,9 +146,11 @@ def motion_lines(figures: dict[str, float | None], sensor: Sensor, duration_us: 
     sensor, duration_us : the same.
     """
     aps, length = sensor.spec.aps, f"{duration_us * S_PER_US:g} s"
-    first = f"{figures['moving']:.0%} of the picture moves, at up to {figures['speed_px_per_s']:.3g} px/s"
+    first = (
+        f"{figures['moving']:.0%} of the picture moves, at up to {_rounded(figures['speed_px_per_s'] or 0.0, 3)} px/s"
+    )
     if aps is not None:
-        first += f": {figures['blur_px']:.2g} px in an exposure of {aps.exposure_us / 1000:g} ms"
+        first += f": {_rounded(figures['blur_px'] or 0.0)} px in an exposure of {aps.exposure_us / 1000:g} ms"
     lines = [first]
     mean, busy, most = (figures[name] for name in ("events_per_s", "busy_events_per_s", "readout_events_per_s"))
     if mean is not None and busy is not None:
@@ -154,6 +159,8 @@ def motion_lines(figures: dict[str, float | None], sensor: Sensor, duration_us: 
             text += f" (the read-out takes {_rate(most)}{': EVENTS WILL BE LOST' if busy > most else ''})"
         lines.append(f"{text}; without noise, shadows and highlights")
     of = [] if figures["frames"] is None else [f"{figures['frames']:g} frames"]
-    of += [] if figures["events"] is None else [f"{float(format(figures['events'], '.2g')):g} events"]
-    lines.append(f"a recording of {length} has about {(figures['bytes'] or 0.0) / 1e6:.2g} MB: {' and '.join(of)}")
+    of += [] if figures["events"] is None else [f"{_rounded(figures['events'])} events"]
+    lines.append(
+        f"a recording of {length} has about {_rounded((figures['bytes'] or 0.0) / 1e6)} MB: {' and '.join(of)}"
+    )
     return lines

@@ -30,6 +30,7 @@ def import_recording(
     *,
     events: str | Path | None = None,
     frames: Sequence[str | Path] = (),
+    format: str | None = None,
     trigger_channel: int | None = None,
     from_zero: bool = False,
     overwrite: bool = False,
@@ -46,6 +47,7 @@ def import_recording(
         NPY, npz of H-ESIM and RGB-Event-ISP, or RAW files of cameras, through rawpy, as DNG of cameras. Frame k begins
         at k / frame rate of the sensor file, and has the exposure of that file. Or one MCAP file, whose images are
         taken with their own times, which are those of the ends of their first rows' exposures.
+    format : of the event file, such as ``evt3``; a file of another one is refused. Default: as the file states.
     trigger_channel : line of the event file whose triggers are the exposures of the frames' first rows: a rising edge
         at the begin and a falling one at the end of each, so that frames and events have one clock. None: the times
         above.
@@ -61,7 +63,8 @@ def import_recording(
     OutputError
         If `path` exists (and `overwrite` is not set) or cannot be written.
     RangeError
-        If neither events nor frames are given, frames of a sensor that has none, or a line of triggers without both.
+        If neither events nor frames are given, frames of a sensor that has none, a line of triggers without both, or
+        a format that is unknown or without events.
     SpecError
         If a file is damaged, does not fit the sensor, or has other triggers than a pulse for each frame.
     """
@@ -71,7 +74,9 @@ def import_recording(
         raise RangeError("frames", list(frames), "events, frames or both")
     if frames and aps is None:
         raise RangeError("frames", len(frames), f"none, because {sensor.spec.name} has no frame pixels")
-    stream = None if events is None else _events(events, sensor)
+    if format is not None and events is None:
+        raise RangeError("format", format, "nothing, unless events are given")
+    stream = None if events is None else _events(events, sensor, format)
     if trigger_channel is not None and (stream is None or not frames):
         raise RangeError("trigger_channel", trigger_channel, "nothing, unless both events and frames are given")
     # begin and length of each exposure, µs; the recording ends with the last row, or with the events
@@ -127,10 +132,10 @@ def _name(file: str | Path | None) -> str | None:
     return None if file is None else Path(file).name
 
 
-def _events(file: str | Path, sensor: Sensor) -> EventStream:
+def _events(file: str | Path, sensor: Sensor, format: str | None) -> EventStream:
     """The events of a file, whose grid, where it states one, must be that of the sensor."""
     grid = sensor.layout.evs_shape
-    stream = open_events(file, shape=grid, keep_stated=True)
+    stream = open_events(file, format, shape=grid, keep_stated=True)
     if stream.shape != grid:
         (rows, cols), (wanted_rows, wanted_cols) = stream.shape, grid
         problem = f"is of {cols}x{rows} px; the event grid of {sensor.spec.name} has {wanted_cols}x{wanted_rows}"

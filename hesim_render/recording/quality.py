@@ -82,7 +82,7 @@ def _events(part: dict[str, Any]) -> str:
         verdict = "none was missed and none was extra" if none else (
             f"{_percent(part['missed'])} are missed, {_percent(part['extra'])} extra"
         )  # fmt: skip
-        return f"; of {max(true or 0, result or 0):.0f} signal events that were seen {verdict} (too few for a bound)"
+        return f"; of {max(true or 0, result or 0):.0f} noise-free events that it saw {verdict} (too few for a bound)"
     return (
         f"; of signal events {_percent(part['missed'])} missed (at most {_percent(part['missed_at_most'])}), "
         f"{_percent(part['extra'])} extra (at most {_percent(part['extra_at_most'])})"

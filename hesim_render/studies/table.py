@@ -218,7 +218,8 @@ LEVELS = {"white_saturation": "white / saturation", "dynamic_range_db": "DR, dB"
 NOTE = (
     "Noise-aware: with the matrix of the least squared error, noise of this light and exposure included; the fair one "
     "to compare filter sets. Noise-free: with the matrix of the least colour error, fitted as if there was no noise. "
-    "CLIPPED: a perfect white is above saturation; closed forms do not know that, simulated figures do."
+    "CLIPPED: a perfect white is above saturation; closed forms do not know that, simulated figures do. These "
+    "also have intervals: `noise: {repeats: 8}` in the file of the study adds them."
 )
 
 

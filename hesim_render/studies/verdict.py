@@ -64,16 +64,21 @@ class _Ranked:
     cost: float | None
     clips: bool
 
+    @property
+    def has_interval(self) -> bool:
+        return self.low < self.high
+
     def __str__(self) -> str:
-        interval = f" ({self.low:.3g} to {self.high:.3g})" if self.low < self.high else ""
-        return f"{self.name} {self.value:.3g}{interval}{' CLIPPED' if self.clips else ''}"
+        interval = f" ({self.low:.3g} to {self.high:.3g})" if self.has_interval else ""
+        return f"{self.name}: {self.value:.3g}{interval}{' CLIPPED' if self.clips else ''}"
 
 
 def ranking(table: Table) -> list[str]:
     """One sentence for each light level, with the order of the noise-aware YSNR and what is worse for it.
 
-    ``>`` stands between two whose 95 % intervals do not meet, ``~`` where they do. Where white clips, the candidate is
-    flagged; where the grey card does, it has no figure and is named at the end.
+    ``>`` stands between two whose 95 % intervals do not meet, ``~`` where they do, a comma where one has no interval:
+    then the sentence says that nothing tells which difference counts. Where white clips, the candidate is flagged;
+    where the grey card does, it has no figure and is named at the end.
 
     Parameters
     ----------
@@ -102,11 +107,15 @@ def _sentence(rows: Table, own: Sequence[str]) -> str | None:
         return None
     ranked = sorted((_ranked(row, own) for row in rows if row[_RANKED] is not None), key=lambda one: -one.value)
     saturated = [_name(row, own) for row in rows if row[_RANKED] is None and row.get("white_clipped")]
-    order = str(ranked[0]) if ranked else "none"
-    for before, after in itertools.pairwise(ranked[:_MOST_NAMED]):
-        order += f" {'>' if before.low > after.high else '~'} {after}"
+    named = ranked[:_MOST_NAMED]
+    order = str(named[0]) if named else "none"
+    for before, after in itertools.pairwise(named):
+        alike = " ~ " if before.low <= after.high else " > "
+        order += f"{alike if before.has_interval and after.has_interval else ', '}{after}"
     if len(ranked) > _MOST_NAMED:
         order += f", and {len(ranked) - _MOST_NAMED} more"
+    if len(named) > 1 and not all(one.has_interval for one in named):
+        order += " (no intervals to judge the differences by)"
     text = f"noise-aware YSNR {order}"
     known = [(one.cost, one) for one in ranked if one.cost is not None]
     if known:

@@ -1,5 +1,6 @@
 """Building: the same bytes for any number of workers and after kills, and nothing that is not whole."""
 
+import io
 import json
 import os
 import random
@@ -12,6 +13,7 @@ import time
 import h5py
 import numpy as np
 import pytest
+from PIL import Image
 from steps import Steps
 
 import hesim_render as hr
@@ -19,7 +21,7 @@ from benchmarks import SMALL, generated, small
 from hesim_render import cli
 from hesim_render.benchmark import Benchmark, build_benchmark, local, verify_benchmark
 from hesim_render.benchmark.build import REPORT_FILE, UnfinishedError
-from hesim_render.benchmark.card import card, spread
+from hesim_render.benchmark.card import _own_ticks, card, histograms, spread
 from hesim_render.benchmark.clip import CLIP_FILE, build_clip, clip_folder
 from hesim_render.benchmark.forecast import estimate_build
 from hesim_render.benchmark.local import LocalWorkers
@@ -472,6 +474,19 @@ def test_the_card_says_how_clips_differ(built):
     assert spread(contents)["contrast"]["max"] == max(values)
     assert spread(contents)["speed_widths_per_s"]["zero"] == 1
     assert (built.root / "histograms.png").stat().st_size > 1000
+
+
+def test_axes_of_alike_clips_have_numbers_that_do_not_overlap():
+    """Ends of the range, or one number; powers of ten tell a range of two decades or more."""
+    assert _own_ticks(np.array([7.5, 3.0, 4.0])) == [3.0, 7.5] and _own_ticks(np.array([3.0, 300.0])) == []
+    assert _own_ticks(np.array([3.0, 5.0, 4.0])) == pytest.approx([15**0.5])
+    one = {"figures": dict.fromkeys(("brightness_e_per_s", "contrast", "activity_hz", "speed_widths_per_s"), 1.7)}
+    with Image.open(io.BytesIO(histograms([one]))) as picture:
+        shades = np.asarray(picture.convert("L"))
+    left = shades[:200, 24:36] < 128  # numbers of clips beside the first axis: 0 and 1
+    assert np.count_nonzero(np.diff(left.any(axis=1).astype(int)) == 1) == 1
+    below = shades[216:240] < 128  # numbers on the four axes
+    assert 4 <= np.count_nonzero(np.diff(below.any(axis=0).astype(int)) == 1) <= 24
 
 
 def test_a_share_of_the_clips_is_audited():

@@ -265,7 +265,7 @@ def test_the_readout_limit_is_the_mean_of_the_fullest_windows():
     windows[197] = 2
     assert readout_limit([one])[0]["value"] is not None
     windows[[198, 199, 200]] = 4, 10, 5  # 19 are too few
-    assert "it is at least 2e+05 events/s" in readout_limit([one])[0]["reason"]
+    assert "it is at least 200,000 events/s" in readout_limit([one])[0]["reason"]
 
 
 def test_a_target_whose_cycles_do_not_show_tells_no_thresholds():

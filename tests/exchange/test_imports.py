@@ -49,6 +49,8 @@ def test_what_does_not_fit_the_sensor_is_refused(tmp_path):
         ({"frames": [tmp_path / "small.npy"]}, r"expected \(96, 128\)"),
         ({"frames": [tmp_path / "float.npy"]}, "expected whole numbers"),
         ({"frames": [tmp_path / "missing.png"]}, "No such file"),
+        ({"events": events, "format": "evt3"}, "was to be read as evt3, which is evt2"),
+        ({"frames": [tmp_path / "small.npy"], "format": "evt2"}, "expected nothing, unless events are given"),
     ):
         with pytest.raises(HesimError, match=told):
             import_recording(tmp_path / "out", sensor, **options)
@@ -72,6 +74,11 @@ def test_the_command_makes_a_recording(capsys, tmp_path):
     status, told, error = command(capsys, *words)
     assert (status, error) == (0, "") and "RAW frames: 1 of 128x96 px" in told and "events: 20000" in told
     np.testing.assert_array_equal(Recording.load(tmp_path / "new").events, given.events)
+    for format, wanted in (("evt3", (2, "was to be read as evt3, which is aedat4")), ("aedat4", (0, ""))):
+        status, _, error = command(capsys, *words[:-1], tmp_path / "of-format", "--format", format)
+        assert status == wanted[0] and wanted[1] in error
+    status, _, error = command(capsys, *words[:-1], tmp_path / "x", "--size", "128x96")
+    assert status == 2 and "with --sensor, the size is that of the sensor; --roi takes a part of it" in error
     status, _, error = command(capsys, "import", events, events, "--out", tmp_path / "x")
     assert (status, error) == (
         2,

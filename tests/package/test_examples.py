@@ -5,8 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import consistency_study
 import numpy as np
 import pytest
+
+import hesim_render as hr
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -36,6 +39,17 @@ def test_the_measured_mtf_is_the_closed_form():
     rows = re.findall(r"^ +([\d.]+) +([\d.]+) +([\d.]+)$", run("measure_mtf.py"), re.MULTILINE)
     assert len(rows) == 5
     assert all(abs(float(measured) - float(expected)) < 0.03 for _, measured, expected in rows)
+
+
+def test_the_video_of_a_render_has_the_colours_of_the_scene(monkeypatch):
+    """18 % grey under the study's light, seen by the CIE observer: 0.18 of what stands for white in each of R, G, B."""
+    for name, value in {"SIZE": (16, 8), "SECONDS": 1 / consistency_study.FPS, "SAMPLES": 16}.items():
+        monkeypatch.setattr(consistency_study, name, value)
+    light = {"light.illuminant": "LED-B3", "light.illuminance_lux": consistency_study.LUX}
+    video = consistency_study.linear_video(hr.load_scene("flat-field", light), "LED-B3")
+    assert video.shape == (1, 8, 16, 3)
+    np.testing.assert_allclose(video, 0.18 * consistency_study.WHITE_VALUE, rtol=0.12)  # 16 rays a pixel
+    np.testing.assert_allclose(video.mean(axis=(0, 1, 2)), 0.18 * consistency_study.WHITE_VALUE, rtol=0.01)
 
 
 @pytest.mark.slow

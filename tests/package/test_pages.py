@@ -108,11 +108,17 @@ def test_the_site_does_not_cut_options_and_short_names():
     pytest.importorskip("mkdocs")
     hooks = runpy.run_path(str(ROOT / "docs" / "hooks.py"))
     page = "<p><code>--roi</code> <code>view RECORDING --no-viewer</code></p>"
+    page += "<td><code>python benchmarks/long_recording.py speed</code></td>"
+    page += "<code>tests/package/a_test_of_many_words.py</code>"
     page += '<div class="language-bash highlight"><code>a<span class="w"> </span>--out<span class="w"> </span>b</div>'
     shown = hooks["on_page_content"](page)
     assert "<code class=whole>--roi</code>" in shown and " <span class=whole>--no-viewer</span></code>" in shown
-    assert "</span><span class=whole>--out</span><span" in shown and "<span class=whole>b" not in shown
+    assert "<code>python <span class=whole>benchmarks/long_recording.py</span> speed<" in shown
+    assert "<code>tests/package/a_test_of_many_words.py<" in shown
+    assert "</span><span class=whole>--out</span><span" in shown and "<span class=whole>b<" not in shown
     assert hooks["plain_text"](shown) == hooks["plain_text"](page)
+    symbols = hooks["INDEXED"].sub(r"\1<sub>\2</sub>", "Φ\u0302_a f_c, but a/b_c and name_of")
+    assert symbols == "Φ\u0302<sub>a</sub> f<sub>c</sub>, but a/b_c and name_of"
 
 
 def test_no_link_is_named_after_its_file():

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+import re
 from html.parser import HTMLParser
 
 import numpy as np
@@ -444,6 +445,18 @@ def test_a_set_whose_white_clips_has_a_hollow_marker():
     assert "stroke-width: 1.5" in drawn[0] and "stroke-width: 1.5" not in drawn[1]
 
 
+def test_names_of_sets_are_not_cut_off_below_a_plot():
+    """The legend has fewer columns where the names are long, and the figure is higher by its lines."""
+    sizes = []
+    for more in ("", " of many pixels and sizes", " which has a name that two columns cannot hold at all"):
+        with report_style():
+            named = ({**row, "filter_set": row["filter_set"] + more, "crosstalk": 0.0} for row in ranked())
+            page = pareto_plot(Table(named), "t")
+        assert page.count(f">ryyb{more}<") == 1
+        sizes.append(float(re.search(r'viewBox="0 0 [\d.]+ ([\d.]+)"', page).group(1)))
+    assert np.diff(sizes).tolist() == [16, 16]
+
+
 def ranked(**changes):
     """Rows of three sets at one level, with figures as a study gives them."""
     common = {"surfaces": "chart", "illuminant": "D65", "illuminance_lux": 20.0, "equal": "exposure", "sensor": "s",
@@ -462,25 +475,40 @@ def ranked(**changes):
 def test_a_level_of_light_has_a_verdict_in_one_sentence():
     (text,) = ranking(Table(ranked()))
     assert text == (
-        "chart, D65, 20 lx, equal exposure: noise-aware YSNR ryyb 41.5 (39.5 to 43.5) > rccb 33 (31 to 35) ~ rggb 30 "
-        "(28 to 32); but the noise-aware ΔE2000 of ryyb is larger: 3.5, that of rggb 2"
+        "chart, D65, 20 lx, equal exposure: noise-aware YSNR ryyb: 41.5 (39.5 to 43.5) > rccb: 33 (31 to 35) ~ rggb: "
+        "30 (28 to 32); but the noise-aware ΔE2000 of ryyb is larger: 3.5, that of rggb 2"
     )
     (text,) = ranking(Table(ranked(ryyb={"delta_e_mean_noise_aware": 2.05, "white_clipped": True})))
-    assert "ryyb 41.5 (39.5 to 43.5) CLIPPED > rccb" in text
+    assert "ryyb: 41.5 (39.5 to 43.5) CLIPPED > rccb" in text
     assert text.endswith("; ryyb has as good a noise-aware ΔE2000 as well")
     (text,) = ranking(Table(ranked(ryyb={"delta_e_mean_noise_aware": 1.9})))
     assert text.endswith("; ryyb has the least noise-aware ΔE2000 as well")
     gone = {f"ysnr_noise_aware{end}": None for end in ("", "_low", "_simulated", "_high")}
     gone |= {"white_clipped": True, "delta_e_mean_noise_aware": None}
     (text,) = ranking(Table(ranked(ryyb=gone)))
-    assert "YSNR rccb 33 (31 to 35) ~ rggb" in text
+    assert "YSNR rccb: 33 (31 to 35) ~ rggb" in text
     assert text.endswith("; not ranked, as even the grey card saturates: ryyb")
 
 
 def test_a_verdict_on_many_sets_names_the_first_ones(monkeypatch):
     monkeypatch.setattr(verdict, "_MOST_NAMED", 2)
     (text,) = ranking(Table(ranked()))
-    assert "ryyb 41.5 (39.5 to 43.5) > rccb 33 (31 to 35), and 1 more; but the noise-aware ΔE2000 of ryyb" in text
+    assert "ryyb: 41.5 (39.5 to 43.5) > rccb: 33 (31 to 35), and 1 more; but the noise-aware ΔE2000 of ryyb" in text
+
+
+def test_a_verdict_without_intervals_says_so():
+    """Closed forms differ by any amount; whether that counts, nothing tells. One interval does not judge a pair."""
+    without = {"ysnr_noise_aware_low": None, "ysnr_noise_aware_high": None}
+    ends = "(no intervals to judge the differences by); but the noise-aware"
+    (text,) = ranking(Table(ranked(ryyb=without, rggb=without, rccb=without)))
+    assert f"YSNR ryyb: 41.5, rccb: 33, rggb: 30 {ends}" in text
+    (text,) = ranking(Table(ranked(rccb=without)))
+    assert f"YSNR ryyb: 41.5 (39.5 to 43.5), rccb: 33, rggb: 30 (28 to 32) {ends}" in text
+    (text,) = ranking(Table(ranked()))
+    assert "no intervals" not in text
+    gone = {f"ysnr_noise_aware{end}": None for end in ("", "_low", "_simulated", "_high")}
+    (text,) = ranking(Table(ranked(ryyb=gone, rccb=gone, rggb=without)))
+    assert "YSNR rggb: 30; " in text and "no intervals" not in text
 
 
 def test_levels_and_candidates_of_a_verdict():
@@ -492,7 +520,7 @@ def test_levels_and_candidates_of_a_verdict():
     plain = [{key: value for key, value in row.items() if "ysnr_noise_aware_" not in key} for row in rows]
     twice = [row | {"crosstalk": share} for row in plain for share in (0.0, 0.08)]
     (text,) = ranking(Table(twice))
-    assert "YSNR ryyb crosstalk 0 41 ~ ryyb crosstalk 0.08 41 > rccb crosstalk 0 32.5 ~ " in text
+    assert "YSNR ryyb crosstalk 0: 41, ryyb crosstalk 0.08: 41, rccb crosstalk 0: 32.5, " in text
     assert ranking(Table(rows[:1])) == ranking(Table([{"sensor": "s"}, {"sensor": "t"}])) == []
 
 

@@ -96,15 +96,14 @@ def readout_limit(tallies: Sequence[EventTally]) -> tuple[dict[str, Any], list[E
     every = np.sum(windows, axis=0)
     full, below = every[most - slack :], every[max(most - 2 * slack - 1, 0) : most - slack]
     rate = US_PER_S / WINDOW_US
+    least = f"{float(f'{most * rate:.4g}'):,.0f}"
     if full.sum() < _LEAST_WINDOWS or full.sum() < 5 * below.sum():
-        return not_identifiable(
-            f"no two of the fullest windows are equally full; it is at least {most * rate:.4g} events/s"
-        ), []
+        return not_identifiable(f"no two of the fullest windows are equally full; it is at least {least} events/s"), []
     each = most / tallies[0].pixels
     if 0 <= np.ceil(each) - each <= _SILENT * np.ceil(each):
         return not_identifiable(
             f"the fullest windows hold {np.ceil(each):g} events of every pixel, so that the pixels or the light limit "
-            f"them; it is at least {most * rate:.4g} events/s"
+            f"them; it is at least {least} events/s"
         ), []
     value = float(np.sum(full * np.arange(most - slack, most + 1)) / full.sum())
     error = max(slack / 2, 1.0) / 2

@@ -13,7 +13,9 @@ from hesim_render import cli
 from hesim_render.core.errors import RangeError
 from hesim_render.describe import motion_figures, motion_lines
 from hesim_render.sources.render.truth import motion_look as look
+from hesim_render.sources.render.truth.chief_rays import SKY, sky_brightness
 from hesim_render.sources.render.truth.motion_look import _bursts, _compared, motion_look
+from hesim_render.spectral.spectrum import illuminance_lux, illuminant, scale_to_irradiance
 
 #: Reflectances of card and wall, and px of the picture by which the card moves to the right in the run.
 CARD, WALL, PATH_PX = 0.12, 0.52, 15.0
@@ -55,6 +57,32 @@ def test_a_sliding_card_gives_the_events_of_its_two_edges(found):
     assert found.moving == pytest.approx(17 * 11 / (44 * 30), rel=0.3)
     middle = found.picture[15 - 2, 22 - 8 + 6]  # the card, 6 px on its way
     np.testing.assert_allclose([middle, found.picture[2, 3]], [[CARD] * 3, [WALL] * 3], rtol=0.01)
+
+
+def test_the_sky_is_as_bright_as_the_light_from_everywhere(tmp_path):
+    """Over that of a white card: its part of the level of all lights, in lux."""
+    everywhere = {"type": "uniform", "illuminant": "A", "illuminance_lux": 330}
+    lamp = {"type": "point", "position_m": [1, 2, 3], "illuminant": "D65", "illuminance_lux": 550}
+    in_watts = {"type": "directional", "direction": [0, 0, -1], "illuminant": "E", "irradiance_w_m2": 4.0}
+    card = {"name": "card", "shape": "rectangle", "size_m": [0.4, 0.4, 0], "reflectance": CARD}
+    camera = {"origin_m": [0, 0, 12], "target_m": [0, 0, 0], "horizontal_fov_deg": 4}
+    Image.new("RGB", (4, 2), (90, 90, 90)).save(tmp_path / "sky.png")
+    around = {"type": "environment", "file": str(tmp_path / "sky.png"), "illuminance_lux": 200}
+    watts_lux = illuminance_lux(scale_to_irradiance(illuminant("E"), 4.0))
+    for lights, wanted in (
+        ([everywhere], 1),
+        ([lamp], 0),
+        ([everywhere, lamp], 330 / 880),
+        ([lamp, in_watts, everywhere], 330 / (880 + watts_lux)),
+        ([lamp, around], 200 / 750),
+        ([{"type": "none"}], 0),
+    ):
+        scene = rendering.make_scene(objects=[card], light=lights, camera=camera)
+        assert sky_brightness(scene.spec) == pytest.approx(wanted, rel=1e-6)
+    assert sky_brightness(hr.load_scene("cornell-box").spec) == SKY
+    scene = rendering.make_scene(objects=[card], light=[everywhere, lamp], camera=camera)
+    seen = motion_look(scene, hr.load_sensor("davis346").crop(44, 30), 0.0, DURATION_US)
+    np.testing.assert_allclose([seen.picture[15, 22], seen.picture[2, 3]], [[CARD] * 3, [330 / 880] * 3], rtol=0.01)
 
 
 def test_events_between_two_samples():
@@ -115,6 +143,11 @@ def test_figures_in_words_say_what_is_lost(found):
     moving, events, size = motion_lines(figures, sensor, DURATION_US)
     assert moving == f"{found.moving:.0%} of the picture moves, at up to 300 px/s: 0.6 px in an exposure of 2 ms"
     assert "(the read-out takes 5000/s: EVENTS WILL BE LOST)" in events and "0.05 s" in size
+    large = figures | {"speed_px_per_s": 36_437.0, "blur_px": 364.4, "events_per_s": 94_700.0,
+                       "busy_events_per_s": 12_340_000.0, "events": 5_040_000.0, "bytes": 2.14e9}  # fmt: skip
+    moving, events, size = motion_lines(large, sensor, DURATION_US)
+    assert "up to 36400 px/s: 360 px" in moving and "about 95000/s, 90 % of the time below 12 million/s" in events
+    assert "has about 2100 MB: 2 frames and 5000000 events" in size
     with pytest.raises(RangeError, match=r"look is 0.06; expected 0 to 0.05 s, within the run"):
         motion_look(sliding(), sensor, 60_000.0, DURATION_US)
 

@@ -29,11 +29,14 @@ from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.swept_boxes import Moment
 from hesim_render.sources.render.truth.names import Names
 from hesim_render.sources.scene import Scene
+from hesim_render.specs.light import irradiance
+from hesim_render.specs.scene import SceneSpec
+from hesim_render.spectral.spectrum import illuminance_lux
 
 #: Part of the way to a point in which nothing may lie if the point is visible. The rest is left to rounding.
 FREE_PART = 1 - 1e-4
-#: Brightness that stands for glass and metal, of the sky, and of what is seen at a grazing angle over what faces the
-#: camera (`ChiefRays.brightness`).
+#: Brightness that stands for glass and metal, of the sky of a Mitsuba scene, and of what is seen at a grazing angle
+#: over what faces the camera (`ChiefRays.brightness`).
 CLEAR, SKY, _GRAZING = 0.3, 0.3, 0.35
 
 
@@ -69,6 +72,17 @@ class Placed:
     t_us: NDArray[np.float64]
 
 
+def sky_brightness(spec: SceneSpec) -> float:
+    """Brightness of what lies behind all surfaces, over that of a white card in the same light: the part of the lights'
+    level that comes from everywhere. `SKY` for a Mitsuba scene, whose lights are its own.
+    """
+    if spec.mitsuba is not None:
+        return SKY
+    levels = [(light, irradiance(light)) for light in spec.lights]
+    lux = [(light.type in ("uniform", "environment"), illuminance_lux(level)) for light, level in levels if level]
+    return sum(own for everywhere, own in lux if everywhere) / total if (total := sum(own for _, own in lux)) else 0.0
+
+
 class ChiefRays:
     """Intersects rays from the camera with a moving scene.
 
@@ -91,6 +105,7 @@ class ChiefRays:
 
     def __init__(self, scene: Scene, sensor: Sensor) -> None:
         self._mi = mitsuba()
+        self._sky = sky_brightness(scene.spec)
         self.built = build(self._mi, scene.spec)
         self.view = place_camera(scene.spec, sensor, self.built.mitsuba_sensor())
         self.sensor = self.view.sensor
@@ -201,7 +216,7 @@ class ChiefRays:
         Returns
         -------
         [n, 4]: diffuse reflectance, darker where a surface is seen at a grazing angle. `CLEAR` where glass or metal has
-        none, 1 for lamps, `SKY` where nothing was met.
+        none, 1 for lamps, `sky_brightness` where nothing was met.
         """
         import drjit as dr
 
@@ -219,7 +234,7 @@ class ChiefRays:
             clear = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
             reflected = dr.select(clear & ~dr.any(reflected > 0), CLEAR, reflected)
             shade = _GRAZING + (1 - _GRAZING) * dr.abs(dr.dot(surface.world.n, ray.d))
-            value = dr.select(met, dr.select(rest.shape.is_emitter(), 1.0, reflected * shade), SKY)
+            value = dr.select(met, dr.select(rest.shape.is_emitter(), 1.0, reflected * shade), self._sky)
             columns = [value[k] + dr.zeros(mi.Float, part.stop - part.start) for k in range(4)]
             dr.eval(columns)
             for k, column in enumerate(columns):

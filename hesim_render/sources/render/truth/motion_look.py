@@ -1,7 +1,8 @@
 """How a scene moves in the picture, and how many events that gives, from its geometry alone: no light is traced.
 
-Surfaces are as bright as their diffuse reflectance under light from the camera, so shadows, highlights, lamps that
-flicker and noise give no events here. What a pixel sees is the mean over nine rays through its square.
+Surfaces are as bright as their diffuse reflectance under light from the camera, and the sky as a white card where all
+light comes from everywhere; so shadows, highlights, lamps that flicker and noise give no events here. What a pixel sees
+is the mean over nine rays through its square.
 """
 
 from __future__ import annotations
