@@ -15,7 +15,7 @@ from hesim_render.capture.lab import write_captures
 from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
-from hesim_render.core.rng import Stream
+from hesim_render.core.rng import Stream, device_normal
 from hesim_render.pixels.aps.model import APS_TERMS
 from hesim_render.pixels.evs import formulas as evs_formulas
 from hesim_render.pixels.evs.defects import DefectEvents, PixelDefects
@@ -124,6 +124,9 @@ def test_shares_and_rates_are_the_files():
     decades = np.log10(found.on_hz[hot] / 200.0)
     assert abs(decades.mean()) < 4.3 * 0.5 / np.sqrt(hot.sum())
     assert abs(decades.std() / 0.5 - 1) < 4.3 / np.sqrt(2 * hot.sum())
+    # a device of a seed stays that device: the deviates are those of its own stream, signs included
+    own = device_normal(noise.device_seed, Stream.EVENT_DEFECT_RATE, found.key[hot])
+    np.testing.assert_allclose(decades, 0.5 * own.astype(float), atol=1e-6)
     assert np.all(found.on_hz[~hot] == 300) and not found.off_hz.any()
     np.testing.assert_allclose(found.firing_share[~hot], 0.25)
     np.testing.assert_allclose(found.change_hz[~hot], 50 + 1 / 0.06)
