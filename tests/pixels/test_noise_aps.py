@@ -533,7 +533,7 @@ def test_columns_have_offsets_of_their_own():
 
 
 def test_each_map_is_the_deviates_of_its_own_stream_on_the_full_sensor():
-    """Keys and signs too: a device of a seed stays that device. Rows and columns of a region are those of the sensor."""
+    """Keys and signs too: a device of a seed stays that device. Rows and columns are those of the sensor."""
     noise = model("eiger", crop=(24, 16), aps__row_offset_std_dn=1.7, aps__column_offset_std_dn=0.6, aps__dsnu_e=3.0,
                   aps__prnu_rel=0.02)  # fmt: skip
     spec, region = noise.spec, noise.layout
