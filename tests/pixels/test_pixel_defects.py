@@ -51,7 +51,7 @@ def place(events):
 
 
 def test_points_are_a_poisson_process():
-    """Counts, waiting times and marks; 6 scores and 2 Kolmogorov tests at 1e-5: false alarm 1e-4."""
+    """Counts, waiting times and marks; 7 scores and 2 Kolmogorov tests at 1e-5: false alarm 1e-4."""
     rate = np.full(400, 30.0)
     points = PoissonPoints(3, Stream.HOT_EVENTS, np.arange(400, dtype=np.uint32), rate)
     which, t_us, mark = points.between(1234.5, 10e6 + 1234.5)
@@ -65,7 +65,11 @@ def test_points_are_a_poisson_process():
     # independent from stretch to stretch, and of the waiting time
     halves = [np.bincount(which[use], minlength=400) for use in (t_us < 5e6, t_us >= 5e6)]
     assert abs(np.corrcoef(*halves)[0, 1]) < 4.5 / np.sqrt(400)
-    assert abs(np.corrcoef(mark[order][1:][np.diff(which[order]) == 0], waiting)[0, 1]) < 4.5 / np.sqrt(waiting.size)
+    same = np.diff(which[order]) == 0
+    assert abs(np.corrcoef(mark[order][1:][same], waiting)[0, 1]) < 4.5 / np.sqrt(waiting.size)
+    # each point has a mark of its own, which is also that of the last point
+    assert abs(np.corrcoef(mark[order][1:][same], mark[order][:-1][same])[0, 1]) < 4.5 / np.sqrt(waiting.size)
+    np.testing.assert_array_equal(points.last_mark(which, t_us), mark)
 
 
 def test_points_do_not_depend_on_how_they_are_asked_for():
