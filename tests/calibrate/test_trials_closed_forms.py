@@ -490,3 +490,32 @@ def test_the_spread_of_thresholds_is_that_of_two_quantiles_less_counting():
     assert k + 1 < len(parts)
     assert spread == pytest.approx(np.sqrt(np.median(values))) and spread == pytest.approx(0.08, abs=0.03)
     assert [float(one[0]) for one in middles] == pytest.approx([1.5, 2.1], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({}, None), ({(1, 0, 2): 41}, "outside 0 to n_trials"), ({(2, 1, 0): -1}, "outside 0 to n_trials"),
+        (2, "n_on holds 2 steps, contrast 3"), (4, "n_on holds 4 steps, contrast 3"), (float, "must be whole numbers"),
+        ((3, 3, 2), "of the static capture's size"),
+    ],
+)  # fmt: skip
+def test_maps_of_steps_hold_0_to_n_trials(change, words, monkeypatch):
+    """Both ends are right, and as many maps as there are contrasts."""
+    maps = np.zeros((4, 2, 3), np.int64)
+    maps[0, 1, 1], maps[2, 0, 0] = 40, 40
+    maps = maps[: change if isinstance(change, int) else 3]
+    if isinstance(change, dict):
+        for place, value in change.items():
+            maps[place] = value
+    elif change is float:
+        maps = maps.astype(float)
+    elif isinstance(change, tuple):
+        maps = np.zeros(change, np.int64)
+    monkeypatch.setattr(steps, "count_maps", lambda captures, file, name: iter(maps))
+    asked = steps.step_maps(SimpleNamespace(folder=Path("captures")), "n_on", 3, (2, 3), 40)
+    if words is None:
+        np.testing.assert_array_equal(list(asked), maps)
+    else:
+        with pytest.raises(SpecError, match=words):
+            list(asked)
