@@ -519,3 +519,48 @@ def test_maps_of_steps_hold_0_to_n_trials(change, words, monkeypatch):
     else:
         with pytest.raises(SpecError, match=words):
             list(asked)
+
+
+def trials_of(**changes):
+    """Two kinds, two time bins, 2 by 3 pixels; a fifth of the trials is calm, and each calm one gives an event."""
+    calm = np.array([[[10, 2, 0], [0, 0, 0]], [[0, 0, 3], [20, 1, 0]]])
+    on, off = np.zeros((2, 2, 2, 3), int), np.zeros((2, 2, 2, 3), int)
+    on[0, 1], off[1, 0] = calm[0], calm[1]
+    arrays = {"signal_dn": np.array([3.0, 7.0]), "contrast": np.array([20.0, -20.0]), "settle_us": 900.0,
+              "edges_us": np.array([0, 40, 110]), "n_calm": calm, "n_on": on, "n_off": off}  # fmt: skip
+    for name, value in changes.items():
+        arrays[name] = value(arrays[name].copy())
+    return arrays
+
+
+def with_one(place, value):
+    def change(values):
+        values[place] = value
+        return values
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, None),
+        ({"contrast": with_one(0, 20.01)}, "within ±20"), ({"contrast": with_one(1, -20.01)}, "within ±20"),
+        ({"contrast": with_one(1, 0.0)}, "steps up"), ({"signal_dn": with_one(0, 0.0)}, "a step needs light"),
+        ({"n_on": with_one((0, 0, 0, 0), 1)}, "more trials together"), ({"n_calm": with_one((1, 0, 2), 2)}, "fifth|more"),
+        ({"n_calm": with_one((1, 1, 0), 21)}, "fifth"), ({"edges_us": with_one(0, 1)}, "begin with 0"),
+        ({"edges_us": with_one(1, 110)}, "begin with 0"), ({"n_calm": with_one((0, 0, 0), 2**31)}, "beyond 2"),
+    ],
+)  # fmt: skip
+def test_trials_that_are_just_right_and_just_wrong(changes, words, tmp_path):
+    file = tmp_path / "evs_s_curve.npz"
+    np.savez(file, **trials_of(**changes))
+    if words is None:
+        found = trials_module._read(file, has_steps=True)
+        assert found.settle_s == pytest.approx(9e-4) and found.shape == (2, 3)
+        np.testing.assert_allclose(found.edges_s, [0, 4e-5, 1.1e-4])
+        for name, values in (("n_calm", found.calm), ("n_on", found.on), ("n_off", found.off)):
+            np.testing.assert_array_equal(values.reshape(trials_of()[name].shape), trials_of()[name])
+    else:
+        with pytest.raises(SpecError, match=words):
+            trials_module._read(file, has_steps=True)
