@@ -8,6 +8,7 @@ from hesim_render.sensor.reading import read_sensor
 from hesim_render.specs.benchmark import SplitShares
 from hesim_render.specs.boards import CharucoTarget, CircleGridTarget, LedGridTarget
 from hesim_render.specs.charts import DeadLeavesTarget, GreyRampTarget, IntegratingSphereTarget, StepWedgeTarget
+from hesim_render.specs.data_sheet import DataSheetSpec
 from hesim_render.specs.event_bench import Modulation, Steady
 from hesim_render.specs.event_pixels import PhotoreceptorSpec
 from hesim_render.specs.geometry import Region
@@ -24,6 +25,11 @@ LEAVES = {"type": "dead-leaves", "width_m": 0.256, "radius_min_m": 0.002, "texel
 TABLE = {"type": "table", "value": [3.0, 4.0]}
 PSF = {"type": "measured", "sample_um": 0.7, "image_height_mm": [0.0], "kernels": [[[0.0, 0.5, 0.5009]]]}
 CORNER = {"cutoff_hz": 70.0, "min_cutoff_hz": 70.0, "signal_dn": 3.0, "follows_light": True}
+DIM, LIT = {"rate_hz": 3.1, "lux": 0.5}, {"rate_hz": 1.7, "lux": 200.0}
+SLOW, QUICK = {"lux": 5.0, "latency_us": 900.0}, {"lux": 1000.0, "latency_us": 70.0}
+SHEET = {"threshold_on_percent": 20.0, "threshold_off_percent": 25.0, "leak_hz": 1.69, "noise_cutoff_hz": 300.0}
+ONE, TWO = SHEET | {"background": [DIM], "dark_lux": 0.3}, SHEET | {"background": [DIM, LIT]}
+FAST = SHEET | {"background": [DIM], "dark_lux": 0.3, "speed": [SLOW, QUICK], "noise_cutoff_hz": None}
 RELATIONS = [  # model, keys that are right, what makes them wrong
     (CharucoTarget, {"type": "charuco", "square_m": 0.03, "marker_m": 0.0299}, {"marker_m": 0.03}),
     (CircleGridTarget, {"type": "circle-grid", "pitch_m": 0.03, "diameter_m": 0.0299}, {"diameter_m": 0.03}),
@@ -61,6 +67,16 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
     (MeasuredPsf, PSF | {"kernels": [[[1.0] + [0.0] * 256]]}, {"kernels": [[[1.0] + [0.0] * 258]]}),
     (PhotoreceptorSpec, CORNER, {"min_cutoff_hz": 70.1}),
     (TrackSpec, {"object": "a", "keyframes": [{"t_us": 0}, {"t_us": 1}]}, {"keyframes": [{"t_us": 1}, {"t_us": 1}]}),
+    (DataSheetSpec, TWO, {"leak_hz": 1.7}),
+    (DataSheetSpec, TWO, {"dark_lux": 0.3}),
+    (DataSheetSpec, TWO, {"background": [DIM, LIT | {"lux": 0.5}]}),
+    (DataSheetSpec, TWO, {"noise_cutoff_hz": None}),
+    (DataSheetSpec, TWO, {"background": [LIT]}),
+    (DataSheetSpec, ONE, {"dark_lux": None}),
+    (DataSheetSpec, FAST, {"speed": [SLOW, QUICK | {"lux": 5.0}]}),
+    (DataSheetSpec, FAST, {"background": [], "dark_lux": None}),
+    (DataSheetSpec, FAST, {"background": [DIM, LIT], "dark_lux": None}),
+    (DataSheetSpec, FAST, {"background": [DIM, LIT]}),
     (Region, {"x": 0, "y": 0, "width_px": 2**14, "height_px": 2**14}, {"width_px": 2**14 + 1}),
     (ObjectSpec, {"name": "a", "shape": "rectangle", "size_m": [1, 2, 0]}, {"shape": "cube"}),
     (ObjectSpec, {"name": "a", "shape": "rectangle", "size_m": [1, 2, 0]}, {"size_m": [1, 2, -1e-9]}),
