@@ -5,17 +5,19 @@ from pydantic import ValidationError
 
 from hesim_render.core.errors import SpecError
 from hesim_render.sensor.reading import read_sensor
-from hesim_render.specs.benchmark import SplitShares
+from hesim_render.sources.video.options import VideoOptions
+from hesim_render.specs.benchmark import NoiseLevel, SharpSpec, SplitShares
 from hesim_render.specs.boards import CharucoTarget, CircleGridTarget, LedGridTarget
 from hesim_render.specs.charts import DeadLeavesTarget, GreyRampTarget, IntegratingSphereTarget, StepWedgeTarget
-from hesim_render.specs.data_sheet import DataSheetSpec
+from hesim_render.specs.data_sheet import DataSheetSpec, SpeedSpec
 from hesim_render.specs.event_bench import Modulation, Steady
 from hesim_render.specs.event_pixels import PhotoreceptorSpec
 from hesim_render.specs.geometry import Region
 from hesim_render.specs.lens import IlluminationTable, MeasuredPsf
-from hesim_render.specs.light import TableWaveformSpec
-from hesim_render.specs.motion import TrackSpec
-from hesim_render.specs.scene import ObjectSpec
+from hesim_render.specs.light import LightSpec, TableWaveformSpec
+from hesim_render.specs.mitsuba_scene import MitsubaSpec
+from hesim_render.specs.motion import KeyframeSpec, TrackSpec
+from hesim_render.specs.scene import CameraSpec, ObjectSpec
 from hesim_render.specs.study import SurfacesSpec
 from hesim_render.specs.sweep import RangeSpec
 
@@ -30,6 +32,17 @@ SLOW, QUICK = {"lux": 5.0, "latency_us": 900.0}, {"lux": 1000.0, "latency_us": 7
 SHEET = {"threshold_on_percent": 20.0, "threshold_off_percent": 25.0, "leak_hz": 1.69, "noise_cutoff_hz": 300.0}
 ONE, TWO = SHEET | {"background": [DIM], "dark_lux": 0.3}, SHEET | {"background": [DIM, LIT]}
 FAST = SHEET | {"background": [DIM], "dark_lux": 0.3, "speed": [SLOW, QUICK], "noise_cutoff_hz": None}
+POINT = {"type": "point", "position_m": [0, 0, 2], "illuminance_lux": 3.0}
+BOX = {"builtin": "cornell_box"}
+LEVEL = {"illuminance_lux": 30.0, "plane_point_m": [0, 0, 1], "plane_normal": [0, 1, 0]}
+
+
+def pose(last=1.00009, stretch=1.00004, shear=9e-5, mirror=1):
+    """A quarter turn about z and a way, by rows, off by rounding."""
+    return [[0, -1, 0, 0.3], [stretch, shear, 0, -0.2], [0, 0, mirror, 4.0], [0, 0, 0, last]]
+
+
+POSE = {"t_us": 3, "matrix": pose()}
 RELATIONS = [  # model, keys that are right, what makes them wrong
     (CharucoTarget, {"type": "charuco", "square_m": 0.03, "marker_m": 0.0299}, {"marker_m": 0.03}),
     (CircleGridTarget, {"type": "circle-grid", "pitch_m": 0.03, "diameter_m": 0.0299}, {"diameter_m": 0.03}),
@@ -77,6 +90,38 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
     (DataSheetSpec, FAST, {"background": [], "dark_lux": None}),
     (DataSheetSpec, FAST, {"background": [DIM, LIT], "dark_lux": None}),
     (DataSheetSpec, FAST, {"background": [DIM, LIT]}),
+    (SpeedSpec, SLOW, {"bandwidth_hz": 30.0}),
+    (SpeedSpec, SLOW, {"latency_us": None}),
+    (NoiseLevel, {"name": "a", "clean": True}, {"without": ["aps.read"]}),
+    (NoiseLevel, {"name": "a", "clean": True}, {"set": {"aps.read_noise_e": 2.0}}),
+    (SharpSpec, {"times_us": [3, 4]}, {"times_us": [4, 4]}),
+    (SharpSpec, {"times_us": [3, 4]}, {"times_us": [4, 3]}),
+    (SharpSpec, {"times_us": [3, 4]}, {"every_us": 3}),
+    (SharpSpec, {"times_us": [3, 4]}, {"times_us": []}),
+    (CameraSpec, {"focal_length_mm": 8.0}, {"horizontal_fov_deg": 30.0}),
+    (CameraSpec, {"origin_m": [1, 2, 3], "target_m": [1, 2, 2.99]}, {"target_m": [1, 2, 3]}),
+    (LightSpec, POINT, {"position_m": None}),
+    (LightSpec, POINT, {"size_m": [1, 1]}),
+    (LightSpec, POINT, {"direction": [0, 0, -1]}),
+    (LightSpec, POINT, {"rotation_deg": 10.0}),
+    (LightSpec, POINT, {"irradiance_w_m2": 3.0}),
+    (LightSpec, POINT, {"illuminance_lux": None}),
+    (LightSpec, {"type": "none"}, {"illuminance_lux": 3.0}),
+    (LightSpec, {"type": "none"}, {"waveform": {"type": "mains", "frequency_hz": 50, "depth": 0.4}}),
+    (MitsubaSpec, BOX, {"inline": {"a": {"type": "constant"}}}),
+    (MitsubaSpec, BOX, {"builtin": None}),
+    (MitsubaSpec, BOX | {"lit": ["a"]}, {"unlit": ["b"]}),
+    (MitsubaSpec, BOX | LEVEL, {"irradiance_w_m2": 3.0}),
+    (MitsubaSpec, BOX | LEVEL, {"radiance_scale": 2.0}),
+    (MitsubaSpec, BOX | LEVEL, {"plane_normal": None}),
+    (MitsubaSpec, BOX, {"plane_point_m": [0, 0, 1]}),
+    (KeyframeSpec, POSE, {"matrix": pose(last=1.0002)}),
+    (KeyframeSpec, POSE, {"matrix": pose(stretch=1.0002)}),
+    (KeyframeSpec, POSE, {"matrix": pose(shear=2e-4)}),
+    (KeyframeSpec, POSE, {"matrix": pose(mirror=-1)}),
+    (VideoOptions, {"white_e_per_s": 3e5, "white_filter": "clear"}, {"white_lux": 30.0}),
+    (VideoOptions, {"white_e_per_s": 3e5, "white_filter": "clear"}, {"white_filter": None}),
+    (VideoOptions, {"white_e_per_s": 3e5, "white_filter": "clear"}, {"white_e_per_s": None}),
     (Region, {"x": 0, "y": 0, "width_px": 2**14, "height_px": 2**14}, {"width_px": 2**14 + 1}),
     (ObjectSpec, {"name": "a", "shape": "rectangle", "size_m": [1, 2, 0]}, {"shape": "cube"}),
     (ObjectSpec, {"name": "a", "shape": "rectangle", "size_m": [1, 2, 0]}, {"size_m": [1, 2, -1e-9]}),
