@@ -7,6 +7,7 @@ import pytest
 import yaml
 from scipy.stats import chi2, norm
 
+from hesim_render.calibrate import moments
 from hesim_render.calibrate.aps import calibration as frame_calibration
 from hesim_render.calibrate.aps import checks, common_mode, composite, dark, sensor_file, telegraph, variance
 from hesim_render.calibrate.estimate import ALARM
@@ -380,3 +381,22 @@ def test_light_is_there_from_five_deviations_of_a_mean_on_and_until_98_per_cent_
     lit.highest[0, 0] = 255
     with pytest.raises(SpecError, match="saturated at every exposure"):
         check(15.1)
+
+
+def test_the_halves_of_a_frame_are_the_dimmer_and_the_brighter_of_its_clear_pixels():
+    """Pixels at 0, near full scale, or that do not count belong to neither; a pixel at the median is dim."""
+    limit = moments._CLEAR * 1000
+    first = np.array([[0, 0, 0, 0, 7], [9, 20, 33, int(limit) - 1, int(limit) + 1], [41, 1000, 12, 0, 0]], np.uint16)
+    used = np.ones(first.shape, bool)
+    used[2, 2] = False
+    clear = [7, 9, 20, 33, int(limit) - 1, 41]
+    middle = np.median(clear)
+    expected = np.full(first.shape, -1)
+    for place in np.argwhere(used):
+        value = int(first[tuple(place)])
+        if value in clear:
+            expected[tuple(place)] = int(value > middle)
+    np.testing.assert_array_equal(moments._halves(first, used, 1000), expected)
+    first[0, 4] = int(limit)  # the limit itself is not clear
+    assert moments._halves(first, used, 1000)[0, 4] == -1
+    assert np.all(moments._halves(np.zeros((2, 3), np.uint16), np.ones((2, 3), bool), 1000) == -1)
