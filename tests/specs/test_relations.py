@@ -43,6 +43,7 @@ def pose(last=1.00009, stretch=1.00004, shear=9e-5, mirror=1):
 
 
 POSE = {"t_us": 3, "matrix": pose()}
+OTHER_POSE = {"t_us": 3, "matrix": pose(last=0.99991, stretch=0.99996, shear=-9e-5)}
 RELATIONS = [  # model, keys that are right, what makes them wrong
     (CharucoTarget, {"type": "charuco", "square_m": 0.03, "marker_m": 0.0299}, {"marker_m": 0.03}),
     (CircleGridTarget, {"type": "circle-grid", "pitch_m": 0.03, "diameter_m": 0.0299}, {"diameter_m": 0.03}),
@@ -119,6 +120,9 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
     (KeyframeSpec, POSE, {"matrix": pose(stretch=1.0002)}),
     (KeyframeSpec, POSE, {"matrix": pose(shear=2e-4)}),
     (KeyframeSpec, POSE, {"matrix": pose(mirror=-1)}),
+    (KeyframeSpec, OTHER_POSE, {"matrix": pose(last=0.9998)}),
+    (KeyframeSpec, OTHER_POSE, {"matrix": pose(stretch=0.9998)}),
+    (KeyframeSpec, OTHER_POSE, {"matrix": pose(shear=-2e-4)}),
     (VideoOptions, {"white_e_per_s": 3e5, "white_filter": "clear"}, {"white_lux": 30.0}),
     (VideoOptions, {"white_e_per_s": 3e5, "white_filter": "clear"}, {"white_filter": None}),
     (VideoOptions, {"white_e_per_s": 3e5, "white_filter": "clear"}, {"white_e_per_s": None}),
