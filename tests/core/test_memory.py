@@ -9,7 +9,8 @@ import pytest
 import tifffile
 from PIL import Image
 
-from hesim_render.core.errors import HesimError
+from hesim_render.core import guard, hdf5, npz
+from hesim_render.core.errors import HesimError, RangeError, SpecError
 from hesim_render.recording import grey_picture, label_file
 from hesim_render.report import bench, modulated
 from hesim_render.sources.render.scene import deformation, mesh_file, sizes
@@ -84,3 +85,40 @@ def test_columns_and_responses(asks, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(modulated, "_cycles", lambda *given: (0.0, 10.0, 13))
         assert asks(modulated, lambda: modulated._answered(own, SimpleNamespace(file="a.raw"), None)) == 13 * 35
+
+
+def test_archives_and_data_sets(monkeypatch, tmp_path):
+    """All arrays of an archive together; a whole data set or one entry of it, and a chunk of it."""
+    asked = []
+    for module in (npz, hdf5):
+        monkeypatch.setattr(module, "require_memory", lambda size, what, file, *most: asked.append((size, *most)))
+    np.savez(tmp_path / "a.npz", one=np.zeros((7, 5), np.uint16), two=np.zeros((3, 11), np.float64))
+    npz.read_arrays(tmp_path / "a.npz", ("one", "two"))
+    assert asked == [(70,), (70, guard.MOST_BYTES), (70 + 264,), (264, guard.MOST_BYTES)]
+    asked.clear()
+    assert len(list(npz.stream_member(tmp_path / "a.npz", "two", 3, (11,)))) == 3
+    assert asked == [(88, guard.MOST_BYTES)]
+    asked.clear()
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("x", data=np.zeros((7, 5, 3), np.uint16), chunks=(2, 5, 3))
+    hdf5.read_dataset(tmp_path / "a.h5", "as x", "x")
+    hdf5.read_dataset(tmp_path / "a.h5", "as x", "x", 6)
+    assert [size for size, *_ in asked] == [2 * 15 * 2, 7 * 15 * 2, 2 * 15 * 2, 15 * 2]
+    with pytest.raises(RangeError, match="0 to 6"):
+        hdf5.read_dataset(tmp_path / "a.h5", "as x", "x", 7)
+
+
+def test_the_limit_is_half_of_the_machine_or_the_one_given(monkeypatch):
+    monkeypatch.setattr(guard, "_machine_bytes", lambda: 2000)
+    guard.require_memory(1000, "a", "b")
+    guard.require_memory(70, "a", "b", 70)
+    for size, most in ((1001, None), (71, 70)):
+        with pytest.raises(SpecError, match="of memory, more than"):
+            guard.require_memory(size, "a", "b", most)
+    guard.require_picture(5, 20, 10, "b")
+    with pytest.raises(SpecError, match="of memory, more than"):
+        guard.require_picture(5, 20, 11, "b")
+    monkeypatch.setattr(guard, "MOST_PIXELS", 100)
+    guard.require_picture(5, 20, 1, "b")
+    with pytest.raises(SpecError, match="has 5x21 px; a picture has at most 100 px"):
+        guard.require_picture(5, 21, 1, "b")
