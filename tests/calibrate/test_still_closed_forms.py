@@ -167,6 +167,31 @@ def rates_of(rng, lux, ratio, dark, growth, scatter=0.0):
     return np.stack([on, off], axis=1)
 
 
+def test_the_ratio_of_three_lights_is_that_of_its_own_weights():
+    """Errors of n₊ − ρ n₋ with the ρ that comes out: ON and OFF events of a pixel scatter together, so weights of another
+    ρ differ by the light, and so would the ratio."""
+    rng, lux = np.random.default_rng(5), np.array([2.0, 30.0, 90.0, 400.0])
+    off = np.array([0.9, 2.3, 5.1, 4.0])[:, None] * (1 + 0.1 * rng.standard_normal((4, GROUPS)))
+    alike = np.array([0.02, 0.9, 0.3, 0.7])[:, None]
+    noise = 0.2 * rng.standard_normal((4, GROUPS))
+    on = 2.6 * off + 0.4 + 3e-3 * lux[:, None] + noise * (1 - alike) + alike * 0.8 * (off - off.mean(axis=1)[:, None])
+    groups = np.stack([on, off], axis=1)
+    whole = groups.sum(axis=2, keepdims=True)
+    rates = np.concatenate([whole / GROUPS, (whole - groups) / (GROUPS - 1)], axis=2)
+    found = still._three_lights(rates, lux)
+    parts = rates[:, 0, 1:] - found[0] * rates[:, 1, 1:]
+    error = np.sqrt((GROUPS - 1) / GROUPS * ((parts - parts.mean(axis=1)[:, None]) ** 2).sum(axis=1))
+    for k in (0, 3, GROUPS):
+        design = np.stack([rates[:, 1, k], np.ones(4), lux], axis=1)
+        scaled = np.linalg.lstsq(design / error[:, None], rates[:, 0, k] / error, rcond=None)[0]
+        assert found[k] == pytest.approx(scaled[0], rel=1e-6)
+    # weights of a ρ of 1, with which the search begins, give another one
+    parts = rates[:, 0, 1:] - rates[:, 1, 1:]
+    error = parts.std(axis=1)
+    design = np.stack([rates[:, 1, 0], np.ones(4), lux], axis=1)
+    assert abs(np.linalg.lstsq(design / error[:, None], rates[:, 0, 0] / error, rcond=None)[0][0] / found[0] - 1) > 1e-3
+
+
 def test_the_balance_of_three_lights_gives_ratio_and_leak():
     rng, lux = np.random.default_rng(3), [2.0, 60.0, 700.0]
     rates = rates_of(rng, lux, 1.3, 0.5, 1e-3, 1e-5)
