@@ -168,8 +168,10 @@ def rates_of(rng, lux, ratio, dark, growth, scatter=0.0):
 
 
 def test_the_ratio_of_three_lights_is_that_of_its_own_weights():
-    """Errors of n₊ − ρ n₋ with the ρ that comes out: ON and OFF events of a pixel scatter together, so weights of another
-    ρ differ by the light, and so would the ratio."""
+    """Errors of n₊ − ρ n₋ are those with the ρ that comes out.
+
+    ON and OFF events of a pixel scatter together: with another ρ, weights and ratio are others.
+    """
     rng, lux = np.random.default_rng(5), np.array([2.0, 30.0, 90.0, 400.0])
     off = np.array([0.9, 2.3, 5.1, 4.0])[:, None] * (1 + 0.1 * rng.standard_normal((4, GROUPS)))
     alike = np.array([0.02, 0.9, 0.3, 0.7])[:, None]
