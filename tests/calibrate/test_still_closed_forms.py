@@ -387,3 +387,17 @@ def test_simulated_pixels_turn_at_the_ends_of_the_swing(monkeypatch):
             while level - off >= -1e-9:
                 level, downs = level - off, downs + (cycle >= 4)
         assert counts[:, k] == pytest.approx([ups / 3, downs / 3])
+
+
+@pytest.mark.parametrize("true", [(0.21, 0.34, 0.0625), (0.9, 0.4, 0.04)])
+def test_thresholds_with_a_wide_mismatch_are_found_from_their_own_moments(true):
+    """The begin of the search is 20 % off for thresholds and twice too large for the variance."""
+    simulated = target._Simulated(2.1, 12)
+    wanted = simulated.moments(np.array(true))
+    found, slope = simulated.fit(wanted)
+    np.testing.assert_allclose(simulated.moments(found), wanted, rtol=4e-3)
+    np.testing.assert_allclose(found, true, rtol=4e-3)
+    # the slope is that of the moments there, over steps of 5 %
+    away = np.array([0.02 * true[0], 0.0, 0.0])
+    change = (simulated.moments(found + away) - simulated.moments(found - away)) / (2 * away[0])
+    np.testing.assert_allclose(slope[:2, 0], change[:2], rtol=0.1, atol=0.1 * np.abs(slope[0, 0]))

@@ -565,3 +565,23 @@ def test_trials_that_are_just_right_and_just_wrong(changes, words, tmp_path):
     else:
         with pytest.raises(SpecError, match=words):
             trials_module._read(file, has_steps=True)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.03])
+def test_weights_of_cells_are_found_with_the_fit(spread, monkeypatch):
+    """Each fit is weighed by the variance at the one before: with a fit of v/5 + 1, the variance comes near 5/4 of it."""
+    seen = []
+
+    def maximise(cells, eta, theta_v, law, free, variance):
+        seen.append(variance)
+        return eta if variance is None else np.array([[variance / 5 + 1]]), np.eye(1)[None], None
+
+    monkeypatch.setattr(fitted, "maximise", maximise)
+    monkeypatch.setattr(fitted, "cell_variance", lambda cells, eta, theta_v, law: float(eta[0]))
+    cells = SimpleNamespace(spread=np.array([0.0, spread]))
+    eta, _, variance = fitted._fit(cells, np.array([9.0]), 0.1, "sqrt", [True])
+    if spread == 0:
+        assert eta == [9.0] and seen == [None] and variance is None
+    else:
+        assert eta[0] == pytest.approx(1.25, rel=0.06) and variance == seen[-1] == pytest.approx(5 * (eta[0] - 1))
+        assert seen[0] == 9.0 and len(seen) >= 3
