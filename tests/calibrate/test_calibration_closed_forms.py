@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from scipy.special import betainc, gammaincc, ndtr
+from scipy.special import betainc, gammaincc, log_ndtr, logsumexp, ndtr
 from scipy.stats import norm
 
 import hesim_render as hr
@@ -780,3 +780,19 @@ def test_searches_that_end_elsewhere_are_told_where_they_describe_the_counts():
     assert "1 of 5 searches" in found.text and "up to 0.4 standard errors" in found.text
     values[3, 0] = 1.14
     assert event_checks._starts(SimpleNamespace(ends=ends, together=fit)) is None  # 0.28 errors
+
+
+@pytest.mark.parametrize(("m", "trials", "within"), [(0.1, 300, 1e-6), (0.1, 20_000, 1e-3), (0.3, 20_000, 2e-3)])
+def test_the_mean_over_thresholds_of_a_count_is_that_of_a_fine_sum(m, trials, within):
+    """Quadrature about the likeliest threshold, against 56 001 thresholds; the constant is common to all counts."""
+    u = np.array([1.5, 2.5, 3.5, 3.5, 2.5, 1.2])
+    events = np.array([0, 3, 0, trials // 100, trials // 3, trials // 2])
+    counts = SimpleNamespace(u=u, events=events, trials=trials, group=np.zeros(6, int))
+    found = dispersion._Mixture.log_likelihood(counts, m, np.ones(1))
+    z = np.linspace(-14, 14, 56_001)
+    terms = [
+        k * log_ndtr(-a * (1 + m * z)) + (trials - k) * log_ndtr(a * (1 + m * z)) - z * z / 2
+        for a, k in zip(u, events, strict=True)
+    ]
+    away = found - logsumexp(terms, axis=1)
+    assert np.ptp(away) < within

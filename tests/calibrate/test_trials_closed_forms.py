@@ -569,7 +569,7 @@ def test_trials_that_are_just_right_and_just_wrong(changes, words, tmp_path):
 
 @pytest.mark.parametrize("spread", [0.0, 0.03])
 def test_weights_of_cells_are_found_with_the_fit(spread, monkeypatch):
-    """Each fit is weighed by the variance at the one before: with a fit of v/5 + 1, the variance comes near 5/4 of it."""
+    """Each fit is weighed by the variance at the one before: with a fit of v/5 + 1, the variance comes near 5/4."""
     seen = []
 
     def maximise(cells, eta, theta_v, law, free, variance):
