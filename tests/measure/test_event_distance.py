@@ -174,7 +174,7 @@ def test_intervals_and_bounds_are_those_of_the_bootstrap():
 
 
 def test_bounds_are_these_percentiles_of_the_draws(monkeypatch):
-    """Distances of 200 draws that are known: 10 + k between the streams, k within the first; that of the whole is 300."""
+    """Distances of 200 draws 10 + k between the streams, k within the first; 300 is that of the whole."""
     order = np.random.default_rng(6).permutation(200)
     between, within = iter(10.0 + order), iter(1.0 * order[::-1])
 
