@@ -796,3 +796,22 @@ def test_the_mean_over_thresholds_of_a_count_is_that_of_a_fine_sum(m, trials, wi
     ]
     away = found - logsumexp(terms, axis=1)
     assert np.ptp(away) < within
+
+
+def test_floors_and_ceiling_of_s_curves_are_found_from_afar():
+    """Rates of known curves: θ₊, θ₋, width, asymmetry, floors and ceiling, from a start without the last three."""
+    step = np.linspace(-0.6, 0.6, 41)
+    true = np.array([0.19, 0.26, 0.05, 0.06, 0.013, 0.021, 0.94])
+    rates = [
+        true[floor] + (true[6] - true[floor]) * curve(true[:4], polarity, step)
+        for polarity, floor in ((1.0, 4), (-1.0, 5))
+    ]
+    pixels = np.linspace(50, 70, event_checks.GROUPS)
+    counts = [rate[:, None] * pixels * 300 for rate in rates]
+    steps = SimpleNamespace(on=counts[0], off=counts[1], pixels=pixels, trials=300)
+    start = np.array([0.22, 0.23, 0.07, 0.0, 0.0, 0.0, 1.0])
+    found = event_checks._fit(steps, step, np.ones(event_checks.GROUPS, bool), start)
+    np.testing.assert_allclose(found, true, atol=2e-5)
+    levels = event_checks.curve_levels(steps, SimpleNamespace(values=start[:4], step=step))
+    for level, value in ((levels.floor_on, 0.013), (levels.floor_off, 0.021), (levels.ceiling, 0.94)):
+        assert level[0] == pytest.approx(value, abs=2e-5) and level[1] < 1e-3

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, poisson
 
-from hesim_render.calibrate.asynchronous import analysis, defects
+from hesim_render.calibrate.asynchronous import analysis, defects, fit
 from hesim_render.calibrate.asynchronous import checks as trial_checks
 from hesim_render.calibrate.asynchronous import trials as trials_module
 from hesim_render.calibrate.asynchronous.likelihood import LEAK, NAMES, RESPONSE
@@ -585,3 +585,26 @@ def test_weights_of_cells_are_found_with_the_fit(spread, monkeypatch):
     else:
         assert eta[0] == pytest.approx(1.25, rel=0.06) and variance == seen[-1] == pytest.approx(5 * (eta[0] - 1))
         assert seen[0] == 9.0 and len(seen) >= 3
+
+
+def test_grids_of_thresholds_are_laid_about_the_fit_before(monkeypatch):
+    """Twice: about the start, and about the end of the first round, whose grid is kept with the result."""
+    laid, size = [], len(NAMES)
+
+    def climb(likelihood, values, rounds):
+        assert likelihood == laid[-2:] and rounds == 7
+        return values * 1.1, np.ones((5, size)), np.ones(size, bool), -3.0 - len(laid)
+
+    def grid(theta, mismatch):
+        laid.append((theta, mismatch))
+        return laid[-1]
+
+    monkeypatch.setattr(fit, "_climb", climb)
+    monkeypatch.setattr(fit, "threshold_grid", grid)
+    monkeypatch.setattr(fit.Likelihood, "of", lambda sets, law, grids: list(grids))
+    start = 1.0 + np.arange(size)
+    found = fit.fit_trials(["set"], "sqrt", start, rounds=7)
+    at = [(start[t], start[m]) for t, m in zip(fit.THETA, fit.MISMATCH, strict=True)]
+    np.testing.assert_allclose(laid, [*at, *(1.1 * np.array(at))])
+    np.testing.assert_allclose(found.values, 1.21 * start)
+    assert found.likelihood == laid[2:]
