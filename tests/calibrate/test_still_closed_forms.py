@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hesim_render.calibrate.recordings import still, target
+from hesim_render.calibrate.recordings import short_intervals, still, target
 from hesim_render.calibrate.recordings.short_intervals import readout_limit
 from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, SLICES, EventTally, tally
 from hesim_render.exchange import EventStream
@@ -401,3 +401,43 @@ def test_thresholds_with_a_wide_mismatch_are_found_from_their_own_moments(true):
     away = np.array([0.02 * true[0], 0.0, 0.0])
     change = (simulated.moments(found + away) - simulated.moments(found - away)) / (2 * away[0])
     np.testing.assert_allclose(slope[:2, 0], change[:2], rtol=0.1, atol=0.1 * np.abs(slope[0, 0]))
+
+
+def windows_of(counts, pixels=20_000):
+    """Recordings with so many windows of each number of events."""
+    size = max(counts) + 1
+    return SimpleNamespace(windows=np.bincount(list(counts), list(counts.values()), size).astype(int), pixels=pixels)
+
+
+@pytest.mark.parametrize(("counts", "reason"), [
+    ({5000: 40, 4999: 30, 4998: 30, 4997: 20}, None),  # 100 full, 20 below
+    ({5000: 40, 4999: 30, 4998: 30, 4997: 21}, "no two of the fullest windows are equally full"),
+    ({5000: 9, 4998: 11}, None),
+    ({5000: 9, 4998: 10}, "no two of the fullest windows are equally full"),  # fewer than 20
+    ({5000: 40, 4999: 30, 4998: 30, 4995: 20}, None),
+    ({5000: 40, 4999: 30, 4998: 30, 4994: 500}, None),  # too far below to count
+    ({5000: 40, 4999: 30, 4998: 30, 4994: 901}, None),  # less than a tenth of the time
+    ({5000: 40, 4999: 30, 4998: 30, 4994: 899}, None),
+])  # fmt: skip
+def test_a_read_out_at_its_limit_fills_its_windows_equally(counts, reason, monkeypatch):
+    """Full are windows within 2 events of the fullest, as a share of 0.04 % asks for."""
+    monkeypatch.setattr(short_intervals, "_SAME", 4e-4)
+    found, limited = readout_limit([one := windows_of(counts), windows_of({4000: 900, 3000: 70})])
+    if reason is not None:
+        assert reason in found["reason"] and limited == []
+        return
+    full = {count: number for count, number in counts.items() if count >= 4998}
+    mean = sum(count * number for count, number in full.items()) / sum(full.values())
+    assert found["value"] == pytest.approx(1000 * mean) and found["standard_error"] == pytest.approx(500)
+    assert found["interval_95"] == pytest.approx([1000 * (mean - 1), 1000 * (mean + 1)])
+    assert limited == ([one] if sum(full.values()) > 0.1 * sum(counts.values()) else [])
+
+
+WHOLE = [(5000, True), (5102, True), (5103, False), (4999, False), (1683, True)]
+
+
+@pytest.mark.parametrize(("pixels", "is_limit_of_pixels"), WHOLE)
+def test_windows_that_hold_whole_events_of_every_pixel_tell_no_limit(pixels, is_limit_of_pixels):
+    """Up to 2 % below 1 event, or 3, of each pixel, as a few pixels are silent; above 1 it is no whole number."""
+    found, _ = readout_limit([windows_of({5000: 60, 4999: 60}, pixels)])
+    assert ("events of every pixel" in found.get("reason", "")) == is_limit_of_pixels
