@@ -5,11 +5,12 @@ from types import SimpleNamespace
 
 import h5py
 import numpy as np
+import OpenEXR
 import pytest
 import tifffile
 from PIL import Image
 
-from hesim_render.core import guard, hdf5, npz
+from hesim_render.core import exr, guard, hdf5, npz
 from hesim_render.core.errors import HesimError, RangeError, SpecError
 from hesim_render.recording import grey_picture, label_file
 from hesim_render.report import bench, modulated
@@ -59,6 +60,16 @@ def test_pictures_and_textures(asks, tmp_path):
         patch.setattr(mesh_file, "_material_of", lambda part: material)
         patch.setattr(mesh_file, "_pbr", lambda part: part)
         assert asks(mesh_file, lambda: mesh_file._principled(None, part, tmp_path / "a.glb")) == 48 * 35
+
+
+def test_exr_files_are_of_8_bytes_a_value_of_each_channel(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(exr, "require_picture", lambda *sizes: asked.append(sizes))
+    planes = {name: np.zeros((7, 5), np.float32) for name in "RGBAZ"}
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File(header, planes).write(str(tmp_path / "a.exr"))
+    exr.require_exr_fits(tmp_path / "a.exr")
+    assert asked == [(5, 7, 8 * 5, tmp_path / "a.exr")]
 
 
 def test_meshes_and_their_shapes(asks, tmp_path):
