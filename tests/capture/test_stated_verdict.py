@@ -5,6 +5,7 @@ import pytest
 
 from hesim_render.capture.error_meter import ErrorMeter, stated_verdict
 from hesim_render.capture.event_flux import EventFlux
+from hesim_render.capture.lab_trials import TrialPlan
 from hesim_render.capture.scene_run import require_short
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import TooLongError
@@ -85,3 +86,9 @@ def test_the_number_that_would_do_follows_the_root_of_the_rays():
     assert stated_verdict({"frames": meter(2.9), "events": meter(0.1)}, 12, 0.5)["samples_needed"] == 256
     nothing = stated_verdict({"frames": ErrorMeter()}, 12, 0.5)
     assert nothing["verdict"] == "met" and nothing["samples_needed"] is None and "frames_off" not in nothing
+
+
+def test_the_time_of_trials_is_from_each_reset_to_the_end_of_the_last_bin():
+    """17 trials of 900 µs and 2600 µs after them."""
+    plan = TrialPlan(np.ones(2), np.zeros(2), 900, np.array([0, 40, 2600]), np.array([12, 5]))
+    assert plan.trial_us == 3500 and plan.duration_s == pytest.approx(17 * 3500e-6)
