@@ -151,8 +151,9 @@ class FrameStack:
         count, frames, rows, cols = self.shape
         if exposures.shape != (count,):
             raise SpecError(f"{exposures.size} exposures_us for {count} exposures in frames", file=self.file)
-        if exposures.dtype.kind not in "uif" or not np.all(exposures > 0):
+        if exposures.dtype.kind not in "uif" or not np.all((np.rint(exposures) > 0) & (exposures < 2**53)):
             raise SpecError("exposures_us must be numbers above 0, in microseconds", file=self.file)
+        exposures = np.rint(exposures).astype(np.int64)
         if np.unique(exposures).size != count:
             raise SpecError("exposures_us holds one exposure twice; put its frames together", file=self.file)
         if count < 2:
@@ -176,7 +177,7 @@ class FrameStack:
                 f"{spec.roi.height_px}×{spec.roi.width_px}",
                 file=self.file,
             )
-        return exposures.astype(np.int64)
+        return exposures
 
     def __iter__(self) -> Iterator[NDArray]:
         """Frames [row, col] of all exposures in order; each is valid until the next one is requested."""

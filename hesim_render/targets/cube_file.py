@@ -159,7 +159,7 @@ def _cave(file: Path) -> CubeFile:
         with Image.open(path) as image:
             if image.mode not in ("I;16", "I", "L", "LA", "RGBA"):
                 raise SpecError(f"expected grey codes of 16 bits, found mode {image.mode}", file=path)
-            require_memory(2 * image.width * image.height * len(names), "the cube", file)
+            require_memory(4 * image.width * image.height * len(names), "the cube", file)
             codes = np.asarray(image)
             # one scene of the set has 8 bits and an alpha channel
             codes = codes if codes.ndim == 2 else codes[..., 0]

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from scipy.special import betainc, gammaincc, ndtr
+from scipy.special import betainc, gammaincc, log_ndtr, logsumexp, ndtr
 from scipy.stats import norm
 
 import hesim_render as hr
@@ -780,3 +780,38 @@ def test_searches_that_end_elsewhere_are_told_where_they_describe_the_counts():
     assert "1 of 5 searches" in found.text and "up to 0.4 standard errors" in found.text
     values[3, 0] = 1.14
     assert event_checks._starts(SimpleNamespace(ends=ends, together=fit)) is None  # 0.28 errors
+
+
+@pytest.mark.parametrize(("m", "trials", "within"), [(0.1, 300, 1e-6), (0.1, 20_000, 1e-3), (0.3, 20_000, 2e-3)])
+def test_the_mean_over_thresholds_of_a_count_is_that_of_a_fine_sum(m, trials, within):
+    """Quadrature about the likeliest threshold, against 56 001 thresholds; the constant is common to all counts."""
+    u = np.array([1.5, 2.5, 3.5, 3.5, 2.5, 1.2])
+    events = np.array([0, 3, 0, trials // 100, trials // 3, trials // 2])
+    counts = SimpleNamespace(u=u, events=events, trials=trials, group=np.zeros(6, int))
+    found = dispersion._Mixture.log_likelihood(counts, m, np.ones(1))
+    z = np.linspace(-14, 14, 56_001)
+    terms = [
+        k * log_ndtr(-a * (1 + m * z)) + (trials - k) * log_ndtr(a * (1 + m * z)) - z * z / 2
+        for a, k in zip(u, events, strict=True)
+    ]
+    away = found - logsumexp(terms, axis=1)
+    assert np.ptp(away) < within
+
+
+def test_floors_and_ceiling_of_s_curves_are_found_from_afar():
+    """Rates of known curves: θ₊, θ₋, width, asymmetry, floors and ceiling, from a start without the last three."""
+    step = np.linspace(-0.6, 0.6, 41)
+    true = np.array([0.19, 0.26, 0.05, 0.06, 0.013, 0.021, 0.94])
+    rates = [
+        true[floor] + (true[6] - true[floor]) * curve(true[:4], polarity, step)
+        for polarity, floor in ((1.0, 4), (-1.0, 5))
+    ]
+    pixels = np.linspace(50, 70, event_checks.GROUPS)
+    counts = [rate[:, None] * pixels * 300 for rate in rates]
+    steps = SimpleNamespace(on=counts[0], off=counts[1], pixels=pixels, trials=300)
+    start = np.array([0.22, 0.23, 0.07, 0.0, 0.0, 0.0, 1.0])
+    found = event_checks._fit(steps, step, np.ones(event_checks.GROUPS, bool), start)
+    np.testing.assert_allclose(found, true, atol=2e-5)
+    levels = event_checks.curve_levels(steps, SimpleNamespace(values=start[:4], step=step))
+    for level, value in ((levels.floor_on, 0.013), (levels.floor_off, 0.021), (levels.ceiling, 0.94)):
+        assert level[0] == pytest.approx(value, abs=2e-5) and level[1] < 1e-3

@@ -2,11 +2,13 @@
 
 from types import SimpleNamespace
 
+import capture_sets
 import numpy as np
 import pytest
 import yaml
 from scipy.stats import chi2, norm
 
+from hesim_render.calibrate import calibrate_aps, moments
 from hesim_render.calibrate.aps import calibration as frame_calibration
 from hesim_render.calibrate.aps import checks, common_mode, composite, dark, sensor_file, telegraph, variance
 from hesim_render.calibrate.estimate import ALARM
@@ -380,3 +382,54 @@ def test_light_is_there_from_five_deviations_of_a_mean_on_and_until_98_per_cent_
     lit.highest[0, 0] = 255
     with pytest.raises(SpecError, match="saturated at every exposure"):
         check(15.1)
+
+
+def test_the_halves_of_a_frame_are_the_dimmer_and_the_brighter_of_its_clear_pixels():
+    """Pixels at 0, near full scale, or that do not count belong to neither; a pixel at the median is dim."""
+    limit = moments._CLEAR * 1000
+    first = np.array([[0, 0, 0, 0, 7], [9, 20, 33, int(limit) - 1, int(limit) + 1], [41, 1000, 12, 0, 0]], np.uint16)
+    used = np.ones(first.shape, bool)
+    used[2, 2] = False
+    clear = [7, 9, 20, 33, int(limit) - 1, 41]
+    middle = np.median(clear)
+    expected = np.full(first.shape, -1)
+    for place in np.argwhere(used):
+        value = int(first[tuple(place)])
+        if value in clear:
+            expected[tuple(place)] = int(value > middle)
+    np.testing.assert_array_equal(moments._halves(first, used, 1000), expected)
+    first[0, 4] = int(limit)  # the limit itself is not clear
+    assert moments._halves(first, used, 1000)[0, 4] == -1
+    assert np.all(moments._halves(np.zeros((2, 3), np.uint16), np.ones((2, 3), bool), 1000) == -1)
+
+
+def test_clipping_is_judged_by_the_noise_that_was_fitted_and_the_fit_is_repeated_without_odd_pixels(
+    tmp_path, monkeypatch
+):
+    """Two rounds: the second knows the polynomial of the first. In the first, odd pixels drop out of a second fit."""
+    capture_sets.write_frames(tmp_path / "set", size=(24, 32), frames=16)
+    with np.load(tmp_path / "set" / "aps_lit.npz") as data:
+        frames, noise = data["frames"].astype(int), np.random.default_rng(1)
+    frames[:, :, 5, 7] += noise.integers(-90, 90, frames.shape[:2])
+    capture_sets.change(tmp_path / "set" / "aps_lit.npz", frames=np.clip(frames, 0, 1023).astype(np.uint16))
+    judged, fitted = [], []
+    clear, fit = frame_calibration.clear_of_clipping, frame_calibration._fit
+
+    def recorded_clear(lit, signal, k, beta, *rest):
+        judged.append(None if beta is None else beta.copy())
+        return clear(lit, signal, k, beta, *rest)
+
+    def recorded_fit(positions, tile, dark, dark_moments, lit, signals, good, *rest):
+        result = fit(positions, tile, dark, dark_moments, lit, signals, good, *rest)
+        fitted.append((good.copy(), {position: each.beta for position, each in result[0].items()}))
+        return result
+
+    monkeypatch.setattr(frame_calibration, "clear_of_clipping", recorded_clear)
+    monkeypatch.setattr(frame_calibration, "_fit", recorded_fit)
+    calibrate_aps(tmp_path / "set", tmp_path / "c.yaml")
+    exposures = len(frames)
+    assert len(judged) == 2 * exposures and all(beta is None for beta in judged[:exposures])
+    assert [good[5, 7] for good, _ in fitted] == [True, False, False] and all(good[5, 9] for good, _ in fitted)
+    for beta in judged[exposures:]:
+        for position, expected in fitted[1][1].items():
+            np.testing.assert_array_equal(beta[position], expected)

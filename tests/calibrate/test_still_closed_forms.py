@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hesim_render.calibrate.recordings import still, target
+from hesim_render.calibrate.recordings import short_intervals, still, target
 from hesim_render.calibrate.recordings.short_intervals import readout_limit
 from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, SLICES, EventTally, tally
 from hesim_render.exchange import EventStream
@@ -165,6 +165,33 @@ def rates_of(rng, lux, ratio, dark, growth, scatter=0.0):
     off = np.array([0.7, 0.2, 0.05])[: len(lux), None] * (1 + 0.05 * rng.standard_normal(GROUPS + 1))
     on = ratio * off + dark + growth * np.asarray(lux)[:, None] + scatter * rng.standard_normal((len(lux), GROUPS + 1))
     return np.stack([on, off], axis=1)
+
+
+def test_the_ratio_of_three_lights_is_that_of_its_own_weights():
+    """Errors of n₊ − ρ n₋ are those with the ρ that comes out.
+
+    ON and OFF events of a pixel scatter together: with another ρ, weights and ratio are others.
+    """
+    rng, lux = np.random.default_rng(5), np.array([2.0, 30.0, 90.0, 400.0])
+    off = np.array([0.9, 2.3, 5.1, 4.0])[:, None] * (1 + 0.1 * rng.standard_normal((4, GROUPS)))
+    alike = np.array([0.02, 0.9, 0.3, 0.7])[:, None]
+    noise = 0.2 * rng.standard_normal((4, GROUPS))
+    on = 2.6 * off + 0.4 + 3e-3 * lux[:, None] + noise * (1 - alike) + alike * 0.8 * (off - off.mean(axis=1)[:, None])
+    groups = np.stack([on, off], axis=1)
+    whole = groups.sum(axis=2, keepdims=True)
+    rates = np.concatenate([whole / GROUPS, (whole - groups) / (GROUPS - 1)], axis=2)
+    found = still._three_lights(rates, lux)
+    parts = rates[:, 0, 1:] - found[0] * rates[:, 1, 1:]
+    error = np.sqrt((GROUPS - 1) / GROUPS * ((parts - parts.mean(axis=1)[:, None]) ** 2).sum(axis=1))
+    for k in (0, 3, GROUPS):
+        design = np.stack([rates[:, 1, k], np.ones(4), lux], axis=1)
+        scaled = np.linalg.lstsq(design / error[:, None], rates[:, 0, k] / error, rcond=None)[0]
+        assert found[k] == pytest.approx(scaled[0], rel=1e-6)
+    # weights of a ρ of 1, with which the search begins, give another one
+    parts = rates[:, 0, 1:] - rates[:, 1, 1:]
+    error = parts.std(axis=1)
+    design = np.stack([rates[:, 1, 0], np.ones(4), lux], axis=1)
+    assert abs(np.linalg.lstsq(design / error[:, None], rates[:, 0, 0] / error, rcond=None)[0][0] / found[0] - 1) > 1e-3
 
 
 def test_the_balance_of_three_lights_gives_ratio_and_leak():
@@ -360,3 +387,57 @@ def test_simulated_pixels_turn_at_the_ends_of_the_swing(monkeypatch):
             while level - off >= -1e-9:
                 level, downs = level - off, downs + (cycle >= 4)
         assert counts[:, k] == pytest.approx([ups / 3, downs / 3])
+
+
+@pytest.mark.parametrize("true", [(0.21, 0.34, 0.0625), (0.9, 0.4, 0.04)])
+def test_thresholds_with_a_wide_mismatch_are_found_from_their_own_moments(true):
+    """The begin of the search is 20 % off for thresholds and twice too large for the variance."""
+    simulated = target._Simulated(2.1, 12)
+    wanted = simulated.moments(np.array(true))
+    found, slope = simulated.fit(wanted)
+    np.testing.assert_allclose(simulated.moments(found), wanted, rtol=4e-3)
+    np.testing.assert_allclose(found, true, rtol=4e-3)
+    # the slope is that of the moments there, over steps of 5 %
+    away = np.array([0.02 * true[0], 0.0, 0.0])
+    change = (simulated.moments(found + away) - simulated.moments(found - away)) / (2 * away[0])
+    np.testing.assert_allclose(slope[:2, 0], change[:2], rtol=0.1, atol=0.1 * np.abs(slope[0, 0]))
+
+
+def windows_of(counts, pixels=20_000):
+    """Recordings with so many windows of each number of events."""
+    size = max(counts) + 1
+    return SimpleNamespace(windows=np.bincount(list(counts), list(counts.values()), size).astype(int), pixels=pixels)
+
+
+@pytest.mark.parametrize(("counts", "reason"), [
+    ({5000: 40, 4999: 30, 4998: 30, 4997: 20}, None),  # 100 full, 20 below
+    ({5000: 40, 4999: 30, 4998: 30, 4997: 21}, "no two of the fullest windows are equally full"),
+    ({5000: 9, 4998: 11}, None),
+    ({5000: 9, 4998: 10}, "no two of the fullest windows are equally full"),  # fewer than 20
+    ({5000: 40, 4999: 30, 4998: 30, 4995: 20}, None),
+    ({5000: 40, 4999: 30, 4998: 30, 4994: 500}, None),  # too far below to count
+    ({5000: 40, 4999: 30, 4998: 30, 4994: 901}, None),  # less than a tenth of the time
+    ({5000: 40, 4999: 30, 4998: 30, 4994: 899}, None),
+])  # fmt: skip
+def test_a_read_out_at_its_limit_fills_its_windows_equally(counts, reason, monkeypatch):
+    """Full are windows within 2 events of the fullest, as a share of 0.04 % asks for."""
+    monkeypatch.setattr(short_intervals, "_SAME", 4e-4)
+    found, limited = readout_limit([one := windows_of(counts), windows_of({4000: 900, 3000: 70})])
+    if reason is not None:
+        assert reason in found["reason"] and limited == []
+        return
+    full = {count: number for count, number in counts.items() if count >= 4998}
+    mean = sum(count * number for count, number in full.items()) / sum(full.values())
+    assert found["value"] == pytest.approx(1000 * mean) and found["standard_error"] == pytest.approx(500)
+    assert found["interval_95"] == pytest.approx([1000 * (mean - 1), 1000 * (mean + 1)])
+    assert limited == ([one] if sum(full.values()) > 0.1 * sum(counts.values()) else [])
+
+
+WHOLE = [(5000, True), (5102, True), (5103, False), (4999, False), (1683, True)]
+
+
+@pytest.mark.parametrize(("pixels", "is_limit_of_pixels"), WHOLE)
+def test_windows_that_hold_whole_events_of_every_pixel_tell_no_limit(pixels, is_limit_of_pixels):
+    """Up to 2 % below 1 event, or 3, of each pixel, as a few pixels are silent; above 1 it is no whole number."""
+    found, _ = readout_limit([windows_of({5000: 60, 4999: 60}, pixels)])
+    assert ("events of every pixel" in found.get("reason", "")) == is_limit_of_pixels

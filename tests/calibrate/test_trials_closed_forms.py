@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, poisson
 
-from hesim_render.calibrate.asynchronous import analysis, defects
+from hesim_render.calibrate.asynchronous import analysis, defects, fit
 from hesim_render.calibrate.asynchronous import checks as trial_checks
 from hesim_render.calibrate.asynchronous import trials as trials_module
 from hesim_render.calibrate.asynchronous.likelihood import LEAK, NAMES, RESPONSE
@@ -490,3 +490,121 @@ def test_the_spread_of_thresholds_is_that_of_two_quantiles_less_counting():
     assert k + 1 < len(parts)
     assert spread == pytest.approx(np.sqrt(np.median(values))) and spread == pytest.approx(0.08, abs=0.03)
     assert [float(one[0]) for one in middles] == pytest.approx([1.5, 2.1], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({}, None), ({(1, 0, 2): 41}, "outside 0 to n_trials"), ({(2, 1, 0): -1}, "outside 0 to n_trials"),
+        (2, "n_on holds 2 steps, contrast 3"), (4, "n_on holds 4 steps, contrast 3"), (float, "must be whole numbers"),
+        ((3, 3, 2), "of the static capture's size"),
+    ],
+)  # fmt: skip
+def test_maps_of_steps_hold_0_to_n_trials(change, words, monkeypatch):
+    """Both ends are right, and as many maps as there are contrasts."""
+    maps = np.zeros((4, 2, 3), np.int64)
+    maps[0, 1, 1], maps[2, 0, 0] = 40, 40
+    maps = maps[: change if isinstance(change, int) else 3]
+    if isinstance(change, dict):
+        for place, value in change.items():
+            maps[place] = value
+    elif change is float:
+        maps = maps.astype(float)
+    elif isinstance(change, tuple):
+        maps = np.zeros(change, np.int64)
+    monkeypatch.setattr(steps, "count_maps", lambda captures, file, name: iter(maps))
+    asked = steps.step_maps(SimpleNamespace(folder=Path("captures")), "n_on", 3, (2, 3), 40)
+    if words is None:
+        np.testing.assert_array_equal(list(asked), maps)
+    else:
+        with pytest.raises(SpecError, match=words):
+            list(asked)
+
+
+def arrays_of(**changes):
+    """Two kinds, two time bins, 2 by 3 pixels; a fifth of the trials is calm, and each calm one gives an event."""
+    calm = np.array([[[10, 2, 0], [0, 0, 0]], [[0, 0, 3], [20, 1, 0]]])
+    on, off = np.zeros((2, 2, 2, 3), int), np.zeros((2, 2, 2, 3), int)
+    on[0, 1], off[1, 0] = calm[0], calm[1]
+    arrays = {"signal_dn": np.array([3.0, 7.0]), "contrast": np.array([20.0, -20.0]), "settle_us": 900.0,
+              "edges_us": np.array([0, 40, 110]), "n_calm": calm, "n_on": on, "n_off": off}  # fmt: skip
+    for name, value in changes.items():
+        arrays[name] = value(arrays[name].copy())
+    return arrays
+
+
+def with_one(place, value):
+    def change(values):
+        values[place] = value
+        return values
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, None),
+        ({"contrast": with_one(0, 20.01)}, "within ±20"), ({"contrast": with_one(1, -20.01)}, "within ±20"),
+        ({"contrast": with_one(1, 0.0)}, "steps up"), ({"signal_dn": with_one(0, 0.0)}, "a step needs light"),
+        ({"n_on": with_one((0, 0, 0, 0), 1)}, "more trials together"),
+        ({"n_calm": with_one((1, 0, 2), 2)}, "more trials together"),
+        ({"n_calm": with_one((1, 1, 0), 21)}, "fifth"), ({"edges_us": with_one(0, 1)}, "begin with 0"),
+        ({"edges_us": with_one(1, 110)}, "begin with 0"), ({"n_calm": with_one((0, 0, 0), 2**31)}, "beyond 2"),
+    ],
+)  # fmt: skip
+def test_trials_that_are_just_right_and_just_wrong(changes, words, tmp_path):
+    file = tmp_path / "evs_s_curve.npz"
+    np.savez(file, **arrays_of(**changes))
+    if words is None:
+        found = trials_module._read(file, has_steps=True)
+        assert found.settle_s == pytest.approx(9e-4) and found.shape == (2, 3)
+        np.testing.assert_allclose(found.edges_s, [0, 4e-5, 1.1e-4])
+        for name, values in (("n_calm", found.calm), ("n_on", found.on), ("n_off", found.off)):
+            np.testing.assert_array_equal(values.reshape(arrays_of()[name].shape), arrays_of()[name])
+    else:
+        with pytest.raises(SpecError, match=words):
+            trials_module._read(file, has_steps=True)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.03])
+def test_weights_of_cells_are_found_with_the_fit(spread, monkeypatch):
+    """Each fit is weighed by the variance at the one before: with a fit of v/5 + 1, the variance comes near 5/4."""
+    seen = []
+
+    def maximise(cells, eta, theta_v, law, free, variance):
+        seen.append(variance)
+        return eta if variance is None else np.array([[variance / 5 + 1]]), np.eye(1)[None], None
+
+    monkeypatch.setattr(fitted, "maximise", maximise)
+    monkeypatch.setattr(fitted, "cell_variance", lambda cells, eta, theta_v, law: float(eta[0]))
+    cells = SimpleNamespace(spread=np.array([0.0, spread]))
+    eta, _, variance = fitted._fit(cells, np.array([9.0]), 0.1, "sqrt", [True])
+    if spread == 0:
+        assert eta == [9.0] and seen == [None] and variance is None
+    else:
+        assert eta[0] == pytest.approx(1.25, rel=0.06) and variance == seen[-1] == pytest.approx(5 * (eta[0] - 1))
+        assert seen[0] == 9.0 and len(seen) >= 3
+
+
+def test_grids_of_thresholds_are_laid_about_the_fit_before(monkeypatch):
+    """Twice: about the start, and about the end of the first round, whose grid is kept with the result."""
+    laid, size = [], len(NAMES)
+
+    def climb(likelihood, values, rounds):
+        assert likelihood == laid[-2:] and rounds == 7
+        return values * 1.1, np.ones((5, size)), np.ones(size, bool), -3.0 - len(laid)
+
+    def grid(theta, mismatch):
+        laid.append((theta, mismatch))
+        return laid[-1]
+
+    monkeypatch.setattr(fit, "_climb", climb)
+    monkeypatch.setattr(fit, "threshold_grid", grid)
+    monkeypatch.setattr(fit.Likelihood, "of", lambda sets, law, grids: list(grids))
+    start = 1.0 + np.arange(size)
+    found = fit.fit_trials(["set"], "sqrt", start, rounds=7)
+    at = [(start[t], start[m]) for t, m in zip(fit.THETA, fit.MISMATCH, strict=True)]
+    np.testing.assert_allclose(laid, [*at, *(1.1 * np.array(at))])
+    np.testing.assert_allclose(found.values, 1.21 * start)
+    assert found.likelihood == laid[2:]

@@ -5,6 +5,7 @@ import pytest
 
 from hesim_render.capture.error_meter import ErrorMeter, stated_verdict
 from hesim_render.capture.event_flux import EventFlux
+from hesim_render.capture.lab_trials import TrialPlan
 from hesim_render.capture.scene_run import require_short
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import TooLongError
@@ -29,6 +30,26 @@ def test_an_error_is_in_units_of_the_noise_at_the_mean_of_both_halves():
         *(jit().Float(np.full(50, half, np.float32)) for half in (12.0, 20.0)), lambda level, _: 2 * np.sqrt(level)
     )
     assert found.as_dict()["rms"] == pytest.approx(0.5)
+
+
+def test_each_value_counts_once_and_in_large_pictures_a_fixed_part_of_them():
+    """Values of 1, 2, 5 units: √10 by hand. Of 40 000 values, 32 768 different ones, the same in the next picture."""
+    found, places = ErrorMeter(), []
+
+    def noise(level, place):
+        places.append(place)
+        return np.full(level.size, 3.0)
+
+    halves = np.array([[103.0, 94.0, 85.0], [97.0, 106.0, 115.0]], np.float32)
+    found.add(*map(jit().Float, halves), noise)
+    assert found.values == 3 and found.as_dict()["rms"] == pytest.approx(np.sqrt((1 + 4 + 25) / 3), rel=1e-6)
+    large = [jit().Float(np.full(40_000, value, np.float32)) for value in (7.0, 9.0)]
+    found.add(*large, noise)
+    found.add(*large, noise)
+    assert found.values == 3 + 2 * 32_768 and np.array_equal(places[1], places[2])
+    assert np.unique(places[1]).size == 32_768 and places[1].min() < 10 and places[1].max() > 39_990
+    # centre of a bin: at most 2.4 % from 1/3
+    assert found.quantile(0.5) == pytest.approx(1 / 3, rel=0.024)
 
 
 def test_event_truth_is_the_mean_of_both_halves_and_half_of_their_difference():
@@ -65,3 +86,9 @@ def test_the_number_that_would_do_follows_the_root_of_the_rays():
     assert stated_verdict({"frames": meter(2.9), "events": meter(0.1)}, 12, 0.5)["samples_needed"] == 256
     nothing = stated_verdict({"frames": ErrorMeter()}, 12, 0.5)
     assert nothing["verdict"] == "met" and nothing["samples_needed"] is None and "frames_off" not in nothing
+
+
+def test_the_time_of_trials_is_from_each_reset_to_the_end_of_the_last_bin():
+    """17 trials of 900 µs and 2600 µs after them."""
+    plan = TrialPlan(np.ones(2), np.zeros(2), 900, np.array([0, 40, 2600]), np.array([12, 5]))
+    assert plan.trial_us == 3500 and plan.duration_s == pytest.approx(17 * 3500e-6)

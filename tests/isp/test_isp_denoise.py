@@ -10,7 +10,7 @@ from scipy.stats import chi2
 import hesim_render as hr
 from hesim_render.core import bands
 from hesim_render.core.errors import RangeError
-from hesim_render.isp import FrameNoise, collaborate, rows
+from hesim_render.isp import FrameNoise, collaborate, frame_noise, rows
 from hesim_render.isp import denoise as denoising
 from hesim_render.isp.denoise import _each, denoise
 from hesim_render.isp.rows import row_offsets
@@ -414,3 +414,21 @@ def test_borders_of_a_line_repeat_its_outermost_whole_blocks(size, period):
             place -= period
         expected.append(place if place >= 0 else (number + period) % min(size, period))
     assert _padded_index(size, period).tolist() == expected
+
+
+@pytest.mark.parametrize(("rows", "expected"), [({"value": 0.6}, 0.6), ({"value": None}, 0.0), (None, 0.0)])
+def test_a_calibration_gives_its_polynomial_its_rows_and_its_maps(rows, expected, monkeypatch, tmp_path):
+    """What a calibration could not measure counts as none."""
+    beta = [[[0.4, None, 7.0, 0.002, None, 3.0]], [[0.9, 0.31, None, None, 0.5, None]]]
+    maps = {"n_row": np.array([0.5, -0.7]), "n_blc": np.array([[3.0, 1.0], [4.0, -2.0]]), "n_dp": np.full((2, 2), 6.0)}
+    section = {"beta": beta} | ({} if rows is None else {"row_noise_dn": rows})
+    monkeypatch.setattr(frame_noise, "read_calibration", lambda path: {"aps": section})
+    monkeypatch.setattr(frame_noise, "read_maps", lambda path, kind, data, names: {name: maps[name] for name in names})
+    noise = FrameNoise.of_calibration(tmp_path / "calibration.yaml", 25_000)
+    assert noise.row_noise_dn == expected and noise.row_std_dn == 0
+    np.testing.assert_array_equal(noise.offset_dn, np.array([[3.5, 1.5], [3.3, -2.7]], np.float32))
+    # a + b I + c I² at 25 ms, rounding included
+    assert noise.variance((0, 0)) == pytest.approx((0.4 + 7 * 0.025 + 3 * 0.025**2 + 1 / 12, 0.0, 0.002))
+    assert noise.variance((1, 0)) == pytest.approx((0.9 + 1 / 12, 0.31 + 0.5 * 0.025, 0.0))
+    corrected = noise.corrected(np.full((2, 2), 50.0, np.float32))
+    np.testing.assert_allclose(corrected, 50 - noise.offset_dn - 6 * 0.025, rtol=1e-6)

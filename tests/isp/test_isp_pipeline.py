@@ -198,3 +198,21 @@ def test_chart_steps_balance_and_correct():
     np.testing.assert_allclose(report["white_balance"], PAPER_BALANCE, rtol=0.005)
     # nominal sRGB values against ISO 17321-1 reflectances: another chart, so not near zero
     assert report["mean_delta_e_2000"] < 3
+
+
+def test_frames_may_hold_any_kind_of_number_and_must_hold_a_tile():
+    """The same picture from signed and unsigned whole numbers and from floating point."""
+    camera = Camera(
+        channels=list("RGB"), tile=[["RGB"[c] for c in row] for row in QUAD], white_level_dn=4095,
+        white_balance=[1.9, 1, 1.6], matrix=np.eye(3).tolist(),
+    )  # fmt: skip
+    raw = np.random.default_rng(2).integers(100, 4000, (16, 24))
+    expected = process(raw.astype(np.uint16), camera)
+    for kind in ("u2", "u4", "i2", "i8", "f4", "f8"):
+        np.testing.assert_array_equal(process(raw.astype(kind), camera), expected)
+    process(raw[:4, :4], camera)
+    infinite = raw.astype(float)
+    infinite[3, 5] = np.inf
+    for wrong in (raw.astype(bool), raw.astype(complex), raw[:3], raw[:, :3], raw[None], infinite):
+        with pytest.raises(RangeError):
+            process(wrong, camera)

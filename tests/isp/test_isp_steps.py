@@ -232,6 +232,10 @@ def test_automatic_exposure_brings_highlights_to_the_level():
     gain = tone.auto_gain(image, 99, 0.9)
     assert np.percentile((gain * image)[::2, ::2].max(-1), 99) == pytest.approx(0.9, rel=1e-4)
     assert tone.auto_gain(np.zeros((8, 8, 3), dtype=np.float32)) == pytest.approx(50)
+    # as it is: the 99.5 % percentile of the largest channel becomes 0.95, of every second row and column
+    ramp = np.zeros((2, 402, 3), np.float32)
+    ramp[0, ::2, 1] = 0.3 * np.arange(201) / 200
+    assert tone.auto_gain(ramp) == pytest.approx(0.95 / (0.3 * 0.995), rel=1e-5)
 
 
 def test_noise_reduction_lowers_noise_and_keeps_edges():

@@ -173,6 +173,27 @@ def test_intervals_and_bounds_are_those_of_the_bootstrap():
     ]  # fmt: skip
 
 
+def test_bounds_are_these_percentiles_of_the_draws(monkeypatch):
+    """Distances of 200 draws 10 + k between the streams, k within the first; 300 is that of the whole."""
+    order = np.random.default_rng(6).permutation(200)
+    between, within = iter(10.0 + order), iter(1.0 * order[::-1])
+
+    def figure(statistics, draw):
+        return np.array([statistics.source, np.array_equal(draw, np.arange(20))], object)
+
+    def distance(one, other):
+        if one[1]:
+            return 300.0
+        return next(within if one[0] == other[0] else between)
+
+    monkeypatch.setattr(event_distance, "_FIGURES", [("a", "b", figure, distance, False)])
+    streams = [SimpleNamespace(shape=SHAPE, source=name) for name in ("one", "other")]
+    (found,) = event_distances(*streams)
+    # the p-th percentile of 0 to 199 is 1.99 p; the draws are centred on the whole
+    assert found.interval_95 == pytest.approx((300 + 1.99 * (2.5 - 50), 300 + 1.99 * (97.5 - 50)))
+    assert found.within == pytest.approx(1.99 * 95) and found.value == 300
+
+
 def test_an_interval_holds_its_value_where_drawn_parts_have_other_ones():
     """Hot pixels of a part alone: in drawn parts, which repeat, fewer pixels are hot, or more of them."""
     one, other = poisson(21), poisson(22)

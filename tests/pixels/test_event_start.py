@@ -137,6 +137,28 @@ def test_levels_of_comparison_are_drawn_from_the_law():
     assert np.median(other) == pytest.approx(median, abs=0.08)
 
 
+@pytest.mark.parametrize("octave", (0, 2))
+def test_each_bandwidth_has_the_law_of_its_own_periods(octave):
+    """At nodes of the table, 3 and 3.5 σ: levels, noise events and dead times are those of the law.
+
+    A dead time is shorter in longer periods, and nodes of the noise lie closer.
+    """
+    noise = pixels(evs__refractory_period_us=4000, evs__contrast_threshold_on=0.21, evs__contrast_threshold_off=0.245)
+    count, angle = int(np.prod(noise.layout.evs_shape)), start.POLE / 16
+    own_hz = 250 / 2**octave
+    resets_hz = 1e-3 + noise.resets_hz
+    expected = law(Pixels(np.array([3.0]), np.array([3.5]), 4e-3 * own_hz, resets_hz / own_hz, angle / 2**octave))
+    found = start_of(noise, 3, np.full(count, 0.07, np.float32), np.full(count, 0.5**octave), angle)
+    np.testing.assert_allclose(found.events_hz, expected.events[0] * own_hz, rtol=1e-5)
+    asleep = found.dead_us > 0
+    assert abs(asleep.mean() - expected.dead_share[0]) < 4.5 * np.sqrt(expected.dead_share[0] / count)
+    assert found.dead_us.max() < 4000 and stats.kstest(found.dead_us[asleep] / 4000, "uniform").pvalue > 1e-5
+    chance = np.clip(start_chances(noise, 3)[0], stats.norm.cdf(-4), stats.norm.cdf(4))
+    levels = np.interp(chance, np.append(0.0, np.cumsum(expected.share[0])), expected.edges)
+    # quantiles are kept at 161 places, and linear between them
+    assert np.abs(found.reference - levels).max() < 0.02
+
+
 def test_between_octaves_of_bandwidth_the_start_is_linear():
     noise = pixels(evs__refractory_period_us=400)
     count = int(np.prod(noise.layout.evs_shape))

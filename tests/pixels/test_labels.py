@@ -208,6 +208,22 @@ def test_events_lost_in_the_dead_time_are_noise_free_crossings_within_it():
     assert np.mean([event in lost for event in expected]) > 0.9
 
 
+def test_each_lost_event_has_its_own_cause_where_there_are_both():
+    """Of a slow read-out behind pixels with a dead time: what a faster one gives, and what the dead time takes."""
+    noise = model(True, {**NOISY, "beta4": 0.0}, evs__refractory_period_us=3_000,
+                  evs__readout_max_events_per_s=60_000.0, evs__readout_buffer_events=10)  # fmt: skip
+    times = 2_500 * np.arange(1, 41)
+    events, found = run(noise, times)
+    every, labels = run(noise.without("readout_limit"), times)
+    unread, asleep = (keys(found.lost[found.lost_in == cause]) for cause in (Lost.READOUT, Lost.REFRACTORY))
+    assert min(len(unread), len(asleep)) > 300 and found.lost.size == len(unread) + len(asleep)
+    assert unread == keys(every) - keys(events) and asleep == keys(labels.lost)
+    assert np.all(np.diff(found.lost["t_us"]) >= 0)
+    step = np.searchsorted(times, found.lost["t_us"])
+    # a block takes both causes in order of time
+    assert np.any((np.diff(found.lost_in.astype(int)) != 0) & (np.diff(step) == 0))
+
+
 @pytest.mark.parametrize(
     ("noise_dn", "dead_us", "most"),
     [

@@ -9,6 +9,7 @@ from scipy import stats
 
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
+from hesim_render.core.rng import Stream, device_normal
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs.events import EVENT_DTYPE, Origin
 from hesim_render.pixels.evs.labels import Labeller
@@ -89,6 +90,18 @@ def test_without_noise_intervals_are_those_of_each_pixels_own_current():
     z, u = rng.standard_normal(400_000), rng.random(400_000)
     drawn = (3.1 + 0.07 * signal_dn) * (1 + 0.2 * z) + 1.7 * u / (1 - u)
     assert stats.ks_2samp(rate, drawn).pvalue > 1e-5
+
+
+def test_the_spread_of_each_pixel_is_the_deviate_of_its_own_stream():
+    """Keys and signs too: a device of a seed stays that device."""
+    noise = pixels({"process": "drift", "rate_hz": 4.0, "rate_hz_per_dn": 0.0, "spread_rel": 0.15})
+    t_us, place, _ = run(noise, (600_000, 1_700_000))
+    first, last = np.full(PIXELS, 10**9), np.zeros(PIXELS)
+    np.minimum.at(first, place, t_us)
+    np.maximum.at(last, place, t_us)
+    rate = 1e6 * (np.bincount(place, minlength=PIXELS) - 1) / (last - first)
+    deviates = device_normal(noise.device_seed, Stream.LEAK_SPREAD, np.arange(PIXELS, dtype=np.uint32))
+    np.testing.assert_allclose(rate, 4.0 * (1 + 0.15 * deviates.astype(float)), rtol=2e-3)
 
 
 def test_it_begins_as_after_a_long_time():

@@ -9,6 +9,7 @@ from scipy import stats
 
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.rng import Stream, device_normal
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps.fixed_pattern import FixedPattern
 from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
@@ -529,6 +530,28 @@ def test_columns_have_offsets_of_their_own():
     col = crop.layout.col0 - noise.layout.col0
     np.testing.assert_array_equal(crop.fixed_pattern.offset_dn[0], offset[0, col : col + 16])
     assert np.ptp(noise.without("column").fixed_pattern.offset_dn) == 0
+
+
+def test_each_map_is_the_deviates_of_its_own_stream_on_the_full_sensor():
+    """Keys and signs too: a device of a seed stays that device. Rows and columns are those of the sensor."""
+    noise = model("eiger", crop=(24, 16), aps__row_offset_std_dn=1.7, aps__column_offset_std_dn=0.6, aps__dsnu_e=3.0,
+                  aps__prnu_rel=0.02)  # fmt: skip
+    spec, region = noise.spec, noise.layout
+    assert region.row0 > 0 and region.col0 > 0 and region.row0 != region.col0
+
+    def deviates(stream, index):
+        return device_normal(noise.device_seed, stream, np.asarray(index, np.uint32)).astype(float)
+
+    row, col = np.arange(16)[:, None] + region.row0, np.arange(24)[None] + region.col0
+    pixel = row * region.spec.geometry.cols + col
+    offset = (
+        spec.black_level_dn
+        + 1.7 * deviates(Stream.ROW_OFFSET, row)
+        + 0.6 * deviates(Stream.COLUMN_OFFSET, col)
+        + spec.system_gain_dn_per_e * 3.0 * deviates(Stream.DSNU, pixel)
+    )
+    np.testing.assert_allclose(noise.fixed_pattern.offset_dn, offset, rtol=1e-6)
+    np.testing.assert_allclose(noise.fixed_pattern.response, 1 + 0.02 * deviates(Stream.PRNU, pixel), rtol=1e-6)
 
 
 @pytest.mark.parametrize("form", ("physical", "polynomial"))

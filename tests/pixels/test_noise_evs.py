@@ -6,6 +6,7 @@ from scipy import stats
 
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
+from hesim_render.core.rng import Stream, device_normal
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs.model import EVS_TERMS, LEAST_THRESHOLD_REL, EvsNoise
 from hesim_render.sensor.reading import read_sensor
@@ -32,6 +33,21 @@ def level_and_variance(electrons, b, law, k=0.2, t_ref=10_000, t_evs=1000, scale
         variance = b["beta3"] ** 2 * signal + b["beta4"] ** 2
         variance += 2 * b["beta5"] * b["beta3"] * b["beta4"] * np.sqrt(signal)
     return x, variance
+
+
+def test_thresholds_are_the_deviates_of_each_polaritys_own_stream_on_the_full_sensor():
+    """Keys and signs too: a device of a seed stays that device, whatever region of it is read."""
+    noise = model("eiger", crop=(24, 16), scale=np.ones(4), evs__threshold_mismatch_rel=0.07,
+                  evs__contrast_threshold_on=0.21, evs__contrast_threshold_off=0.34)  # fmt: skip
+    region, spec = noise.layout, noise.layout.spec
+    assert region.row0 > 0 and region.col0 > 0 and region.row0 != region.col0
+    row, col = np.divmod(region.evs_pixel, region.cols)
+    pixel = ((row + region.row0) * spec.geometry.cols + col + region.col0).astype(np.uint32)
+    for own, nominal, stream in (
+        (noise.threshold_on_map, 0.21, Stream.THRESHOLD_ON), (noise.threshold_off_map, 0.34, Stream.THRESHOLD_OFF),
+    ):  # fmt: skip
+        expected = nominal * (1 + 0.07 * device_normal(noise.device_seed, stream, pixel).astype(float))
+        np.testing.assert_allclose(own, expected, rtol=1e-6)
 
 
 PAIRS = [(0.0, 0.0), (0.0, 2.0), (2.0, 0.0), (10.0, 10.0), (10.0, 11.0), (30.0, 27.0), (100.0, 100.0), (100.0, 104.0),

@@ -15,7 +15,7 @@ from hesim_render.capture.lab import write_captures
 from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
-from hesim_render.core.rng import Stream
+from hesim_render.core.rng import Stream, device_normal
 from hesim_render.pixels.aps.model import APS_TERMS
 from hesim_render.pixels.evs import formulas as evs_formulas
 from hesim_render.pixels.evs.defects import DefectEvents, PixelDefects
@@ -51,7 +51,7 @@ def place(events):
 
 
 def test_points_are_a_poisson_process():
-    """Counts, waiting times and marks; 6 scores and 2 Kolmogorov tests at 1e-5: false alarm 1e-4."""
+    """Counts, waiting times and marks; 7 scores and 2 Kolmogorov tests at 1e-5: false alarm 1e-4."""
     rate = np.full(400, 30.0)
     points = PoissonPoints(3, Stream.HOT_EVENTS, np.arange(400, dtype=np.uint32), rate)
     which, t_us, mark = points.between(1234.5, 10e6 + 1234.5)
@@ -65,7 +65,11 @@ def test_points_are_a_poisson_process():
     # independent from stretch to stretch, and of the waiting time
     halves = [np.bincount(which[use], minlength=400) for use in (t_us < 5e6, t_us >= 5e6)]
     assert abs(np.corrcoef(*halves)[0, 1]) < 4.5 / np.sqrt(400)
-    assert abs(np.corrcoef(mark[order][1:][np.diff(which[order]) == 0], waiting)[0, 1]) < 4.5 / np.sqrt(waiting.size)
+    same = np.diff(which[order]) == 0
+    assert abs(np.corrcoef(mark[order][1:][same], waiting)[0, 1]) < 4.5 / np.sqrt(waiting.size)
+    # each point has a mark of its own, which is also that of the last point
+    assert abs(np.corrcoef(mark[order][1:][same], mark[order][:-1][same])[0, 1]) < 4.5 / np.sqrt(waiting.size)
+    np.testing.assert_array_equal(points.last_mark(which, t_us), mark)
 
 
 def test_points_do_not_depend_on_how_they_are_asked_for():
@@ -124,6 +128,9 @@ def test_shares_and_rates_are_the_files():
     decades = np.log10(found.on_hz[hot] / 200.0)
     assert abs(decades.mean()) < 4.3 * 0.5 / np.sqrt(hot.sum())
     assert abs(decades.std() / 0.5 - 1) < 4.3 / np.sqrt(2 * hot.sum())
+    # a device of a seed stays that device: the deviates are those of its own stream, signs included
+    own = device_normal(noise.device_seed, Stream.EVENT_DEFECT_RATE, found.key[hot])
+    np.testing.assert_allclose(decades, 0.5 * own.astype(float), atol=1e-6)
     assert np.all(found.on_hz[~hot] == 300) and not found.off_hz.any()
     np.testing.assert_allclose(found.firing_share[~hot], 0.25)
     np.testing.assert_allclose(found.change_hz[~hot], 50 + 1 / 0.06)

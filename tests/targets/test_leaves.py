@@ -6,6 +6,7 @@ from pydantic import TypeAdapter
 from scipy import integrate
 
 from hesim_render.specs.target import TargetSpec
+from hesim_render.targets import resolution
 from hesim_render.targets.build import build_target
 from hesim_render.targets.resolution import leaves_picture
 
@@ -107,3 +108,40 @@ def test_leaves_without_sizes_span_a_400th_to_a_tenth_of_20_cm():
     spec = TypeAdapter(TargetSpec).validate_python({"type": "dead-leaves"})
     sizes = [spec.width_m, spec.width_m / spec.radius_min_m, spec.width_m / spec.radius_max_m, spec.texels_across]
     assert sizes == pytest.approx([0.2, 400, 10, 2048])
+
+
+def test_centres_lie_up_to_a_largest_radius_beyond_every_side(monkeypatch):
+    """Else leaves would be rarer at that side."""
+    real, asked = np.random.default_rng, []
+
+    class Recorded:
+        def __init__(self, seed):
+            self.inner = real(seed)
+
+        def random(self, count):
+            return self.inner.random(count)
+
+        def uniform(self, low, high, count):
+            asked.append((low, high))
+            return self.inner.uniform(low, high, count)
+
+    monkeypatch.setattr(np.random, "default_rng", Recorded)
+    leaves_picture(12, 30, 2.0, 7.0, GREYS, 3)
+    assert asked[:3] == [(-7.0, 37.0), (-7.0, 19.0), GREYS] and len(asked) % 3 == 0
+
+
+def test_the_front_most_leaf_over_a_texel_is_seen():
+    """A loop over leaves and texels, front to back, with the same numbers."""
+    rng, rows, cols = np.random.default_rng(3), 12, 30
+    expected = np.full((rows, cols), np.nan)
+    while np.isnan(expected).any():
+        size = resolution._BATCH
+        u = rng.random(size)
+        radius = 1 / np.sqrt(2.0**-2 - u * (2.0**-2 - 7.0**-2))
+        x, y = rng.uniform(-7, cols + 7, size), rng.uniform(-7, rows + 7, size)
+        grey = rng.uniform(*GREYS, size)
+        for k in range(size):
+            for row, col in np.argwhere(np.isnan(expected)):
+                if np.hypot(col + 0.5 - x[k], row + 0.5 - y[k]) < radius[k]:
+                    expected[row, col] = grey[k]
+    np.testing.assert_allclose(leaves_picture(rows, cols, 2.0, 7.0, GREYS, 3), expected, rtol=1e-6)

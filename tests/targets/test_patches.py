@@ -114,3 +114,10 @@ def test_a_dump_holds_the_numbers_and_is_the_same_target(tmp_path):
     again = type(spec).model_validate(dumped).target.load()
     assert list(again) == ["a", "b"]
     np.testing.assert_array_equal(again["b"].values, [0.3, 0.4])
+
+
+@pytest.mark.parametrize("row", ["a,0.1,0.2", "a,0.1,0.2,0.3,0.4"])
+def test_a_row_has_as_many_cells_as_the_header(row, tmp_path):
+    (tmp_path / "chart.csv").write_text(f"name,400,500,600\n{row}\n")
+    with pytest.raises(SpecError, match=f"expected 4 cells, found {row.count(',') + 1}"):
+        read_patches(tmp_path / "chart.csv")

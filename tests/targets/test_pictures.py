@@ -244,3 +244,26 @@ def test_a_ramp_is_linear_from_side_to_side():
     radiance = seen({"type": "grey-ramp", "reflectance_min": 0.1, "reflectance_max": 0.9}, [550.0], 24, 32, 64)[..., 0]
     # the camera fits the target's width; columns are means over a 32nd of it
     np.testing.assert_allclose(radiance[1], 0.1 + 0.8 * (np.arange(32) + 0.5) / 32, atol=8e-4)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA", "P", "1"])
+def test_pictures_of_8_bits_may_be_stored_in_any_way(mode, tmp_path):
+    """Black and white and, where a mode has them, other greys and colours: the same values as in RGB."""
+    codes = np.zeros((3, 5, 3), np.uint8)
+    codes[1, 2:], codes[2, :3] = 255, 255
+    if mode != "1":
+        codes[0, 1] = 77
+    if mode in ("RGB", "RGBA", "P"):
+        codes[2, 4] = (200, 10, 90)
+    Image.fromarray(codes).save(tmp_path / "plain.png")
+    other = Image.fromarray(codes)
+    other = other.quantize(16) if mode == "P" else other.convert(mode)
+    assert other.mode == mode
+    other.save(tmp_path / "other.png")
+    np.testing.assert_array_equal(
+        np.broadcast_to(read_cube(tmp_path / "other.png").values, (3, 5, 3)), read_cube(tmp_path / "plain.png").values
+    )
+    for wrong in ("I;16", "F"):
+        Image.fromarray(np.zeros((3, 5), np.uint16 if wrong == "I;16" else np.float32)).save(tmp_path / "wrong.tif")
+        with pytest.raises(SpecError):
+            read_cube(tmp_path / "wrong.tif")

@@ -7,6 +7,7 @@ import hesim_render as hr
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.camera import look_at
 from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.trajectories.pose_files import PoseFile, read_poses
 
 SCENE = """\
 schema_version: 1
@@ -193,3 +194,42 @@ def test_a_wrong_track_is_one_line(keys, told, tmp_path):
         hr.load_scene(tmp_path / "scene.yaml")
     assert told in str(caught.value) and "scene.yaml:8" in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(("length", "is_right"), [(0.9901, True), (1.0099, True), (0.9899, False), (1.0101, False)])
+def test_rounding_is_allowed_to_a_quaternion_in_both_directions(length, is_right, tmp_path):
+    """A hundredth of its length; the rotation is that of the quaternion of length 1."""
+    half = length * HALF
+    (tmp_path / "path.tum").write_text(f"0 0 0 0 0 0 0 1\n1 0 0 0 0 {half:.9f} 0 {half:.9f}\n")
+    if not is_right:
+        with pytest.raises(SpecError, match=f"must have the length 1; this one has {length:.4g}"):
+            read_poses(tmp_path / "path.tum")
+        return
+    found = np.array(read_poses(tmp_path / "path.tum")[1]["matrix"])
+    np.testing.assert_allclose(found[:3, :3], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], atol=1e-8)
+
+
+@pytest.mark.parametrize(("last_us", "begin_us", "is_right"), [
+    (10**13, None, True), (10**13 + 1, None, False), (10**13 + 7, 1, True), (10**13 + 8, 1, True),
+    (10**13 + 9, 1, False), (4 * 10**13, 0, False),
+])  # fmt: skip
+def test_times_beyond_116_days_are_dates(last_us, begin_us, is_right, tmp_path):
+    """10 million seconds, counted from the begin that was asked for."""
+    rows = "".join(f"{t},0,0,0,0,0,0,1\n" for t in (9, last_us))
+    (tmp_path / "path.csv").write_text(f"t_us,x_m,y_m,z_m,qx,qy,qz,qw\n{rows}")
+    how = PoseFile(begin_us=begin_us)
+    if is_right:
+        begin = 9 if begin_us is None else begin_us
+        assert [pose["t_us"] for pose in read_poses(tmp_path / "path.csv", how)] == [begin, last_us - 9 + begin]
+    else:
+        with pytest.raises(SpecError, match="its times are dates, from 9 µs on"):
+            read_poses(tmp_path / "path.csv", how)
+
+
+def test_nanoseconds_are_rounded_to_the_next_microsecond(tmp_path):
+    """Whole ones exactly, also where float64 has no such number; halves up."""
+    header = "#timestamp,p_RS_R_x [m],p_RS_R_y,p_RS_R_z,q_RS_w,q_RS_x,q_RS_y,q_RS_z\n"
+    times = (1403636579758555499, 1403636579758556500, 1403636579758558499)
+    (tmp_path / "path.csv").write_text(header + "".join(f"{t},0,0,0,1,0,0,0\n" for t in times))
+    found = read_poses(tmp_path / "path.csv", PoseFile(begin_us=0))
+    assert [pose["t_us"] for pose in found] == [0, 2, 3]

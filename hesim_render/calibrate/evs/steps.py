@@ -118,7 +118,7 @@ def read_contrast(
     return contrast.astype(np.float64), signal, small
 
 
-def step_maps(captures: CaptureSet, name: str, steps: int, shape: tuple[int, ...], most: NDArray | int):  # noqa: ANN201
+def step_maps(captures: CaptureSet, name: str, steps: int, shape: tuple[int, ...], most: int):  # noqa: ANN201
     """Maps [row, col] of ``n_on`` or ``n_off``, one step at a time, each from 0 to `most`.
 
     Raises
@@ -133,8 +133,7 @@ def step_maps(captures: CaptureSet, name: str, steps: int, shape: tuple[int, ...
             raise SpecError(
                 f"{name} must be whole numbers [contrast, row, col] of the static capture's size", file=file
             )
-        limit = most if np.ndim(most) == 0 else most[min(count, steps - 1)]  # type: ignore[index]
-        if counts.min() < 0 or np.any(counts > limit):
+        if counts.min() < 0 or np.any(counts > most):
             raise SpecError(f"{name} holds counts outside 0 to n_trials", file=file)
         count += 1
         yield counts

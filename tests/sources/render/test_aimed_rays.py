@@ -264,3 +264,40 @@ def test_windows_of_looks_are_rounded_outwards_to_eighths_of_their_length():
     zoom = SimpleNamespace(_outlines=outlines)
     Zoom._sites_of(zoom, np.arange(4), np.zeros(4, np.int64), windows, np.arange(4))
     assert sorted(asked) == [(7.0, 10.0), (1000.0, 1900.0), (1100.0, 2000.0)]
+
+
+def test_each_pixel_takes_one_look_at_small_objects():
+    """Inside of an outline that is not aimed at, the rays of that look; under an aimed one alone, those of aimed rays.
+
+    A grid of 4 by 6 pixels that begins at row 20 and column 30, of which one was not asked about.
+    """
+    places = np.arange(24).reshape(4, 6)
+    places[0, 0] = -1
+
+    def outline(target, rows, cols):
+        return SimpleNamespace(target=target, rows=rows, cols=cols)
+
+    def image(one, top, left, shape, margin):
+        assert (top, left, shape) == (20, 30, (4, 6))
+        wider = slice(one.cols.start, one.cols.stop + (margin == 1.5))  # by a column to the right
+        return np.ones((one.rows.stop - one.rows.start, wider.stop - wider.start), bool), (one.rows, wider)
+
+    zoom = SimpleNamespace(
+        _image=image, _aim_margin_px=1.5, _tuning=SimpleNamespace(zoom_margin_px=0.5, aim_rays=16)
+    )  # fmt: skip
+    outlines = [
+        outline(None, slice(0, 2), slice(0, 3)), outline(7, slice(1, 3), slice(2, 4)),
+        outline(9, slice(2, 4), slice(3, 5)),
+    ]  # fmt: skip
+    found = list(Zoom._looks(zoom, outlines, 64, True, places, 20, 30))
+    seen = {}
+    for look in found:
+        for place in look.place.tolist():
+            assert place not in seen and look.is_small is True
+            seen[place] = look.rays
+    # the outline that is not aimed at, without the pixel that was not asked about, and what is left of the others
+    assert seen == dict.fromkeys((1, 2, 6, 7, 8), 64) | dict.fromkeys((9, 14, 15, 16, 21, 22), 16)
+    # what each is aimed at, by the wider outlines
+    aims = {pair for look in found if look.aims for pair in zip(*(each.tolist() for each in look.aims), strict=True)}
+    wide = {(place, 7) for place in (8, 9, 10, 14, 15, 16)} | {(place, 9) for place in (15, 16, 17, 21, 22, 23)}
+    assert aims == {(place, target) for place, target in wide if place in seen}

@@ -14,7 +14,7 @@ from hesim_render.core.errors import RangeError
 from hesim_render.describe import motion_figures, motion_lines
 from hesim_render.sources.render.truth import motion_look as look
 from hesim_render.sources.render.truth.chief_rays import SKY, sky_brightness
-from hesim_render.sources.render.truth.motion_look import _bursts, _compared, motion_look
+from hesim_render.sources.render.truth.motion_look import EventForecast, _bursts, _compared, motion_look
 from hesim_render.spectral.spectrum import illuminance_lux, illuminant, scale_to_irradiance
 
 #: Reflectances of card and wall, and px of the picture by which the card moves to the right in the run.
@@ -202,3 +202,9 @@ def test_the_picture_has_three_colours_and_event_pixels_see_their_mean(monkeypat
     np.testing.assert_allclose(3 * places, np.rint(3 * places), atol=1e-12)
     dark = look._seen(SimpleNamespace(brightness=brightness), np.array([[-9.0, 0.0]]), np.array([[3.0, 0.01]]), 17.0)
     np.testing.assert_allclose(dark, [[1e-4, 2e-4]])  # black has a logarithm
+
+
+def test_the_busy_rate_is_that_of_nine_tenths_of_the_time():
+    rates = np.random.default_rng(3).permutation(np.arange(201.0))
+    forecast = EventForecast(np.full((3, 4), 2.0), 5, rates)
+    assert forecast.mean_hz == pytest.approx(100) and forecast.busy_hz == pytest.approx(180)

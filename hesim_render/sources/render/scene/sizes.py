@@ -18,7 +18,8 @@ _TEXEL = 32
 #: Memory of a vertex with normal and texture coordinates, and of a triangle, bytes.
 _VERTEX, _TRIANGLE = 32, 12
 _PFM = re.compile(rb"P[Ff]\s+(\d+)\s+(\d+)\s")
-_RGBE = re.compile(rb"\n[-+][XY]\s+(\d+)\s+[-+][XY]\s+(\d+)\n")
+#: Most files have rows first, "-Y 768 +X 1024".
+_RGBE = re.compile(rb"\n[-+]([XY])\s+(\d+)\s+[-+][XY]\s+(\d+)\n")
 _PLY_ELEMENT = re.compile(rb"element\s+\S+\s+(\d+)\s((?:\s*(?:property|comment)[^\n]*\n)*)")
 _SCALAR_BYTES = {b"char": 1, b"uchar": 1, b"int8": 1, b"uint8": 1, b"short": 2, b"ushort": 2, b"int16": 2,
                  b"uint16": 2, b"double": 8, b"float64": 8}  # fmt: skip
@@ -54,8 +55,11 @@ def _picture(file: Path, head: bytes) -> tuple[int, int]:
     """Width and height; 0 for a file that is no picture."""
     if head.startswith(b"\x76\x2f\x31\x01"):
         return exr_header(file)[0]
-    if (match := _PFM.match(head) or (head.startswith(b"#?") and _RGBE.search(head))) is not None and match:
+    if (match := _PFM.match(head)) is not None:
         return int(match[1]), int(match[2])
+    if head.startswith(b"#?") and (match := _RGBE.search(head)) is not None:
+        sides = int(match[2]), int(match[3])
+        return sides if match[1] == b"X" else sides[::-1]
     from PIL import Image
 
     with warnings.catch_warnings():
