@@ -59,6 +59,7 @@ class Stream(IntEnum):
     INTERFERENCE = 72
     COMPARATOR_ON = 73
     COMPARATOR_OFF = 74
+    NOISE_SPREAD = 75
 
 
 def stream_key(seed: int, stream: Stream) -> int:

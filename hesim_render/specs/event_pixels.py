@@ -142,6 +142,24 @@ class LeakSpec(Strict):
         return self.rate_hz + self.rate_hz_per_dn * signal_dn + tail_hz
 
 
+class NoiseSpreadSpec(Strict):
+    """Bandwidth of the noise (last_event) that differs from pixel to pixel, about photoreceptor_cutoff_hz."""
+
+    bandwidth_rel: float = Field(0.0, ge=0, le=1, description="std over pixels of its natural logarithm")
+    odd_rows_rel: float = Field(
+        0.0,
+        gt=-1,
+        lt=1,
+        description="relative: rows 1, 3, 5 … of the event grid have so much more, the others so much less",
+    )
+    odd_cols_rel: float = Field(0.0, gt=-1, lt=1, description="the same of columns")
+
+    @property
+    def most(self) -> float:
+        """Largest bandwidth of a pixel over photoreceptor_cutoff_hz: three deviations above the others of its kind."""
+        return (1 + abs(self.odd_rows_rel)) * (1 + abs(self.odd_cols_rel)) * math.exp(3 * self.bandwidth_rel)
+
+
 class ComparatorNoiseSpec(Strict):
     """Events of the comparators' own noise: a Poisson process of each polarity, whatever the light."""
 
@@ -188,6 +206,9 @@ class SheetEvsSpec(Strict):
     comparator_noise: ComparatorNoiseSpec | None = Field(
         None, description="events of both polarities at random times, whatever the light; default none"
     )
+    noise_spread: NoiseSpreadSpec | None = Field(
+        None, description="bandwidth of the noise over pixels (last_event); default the same in all"
+    )
     defects: EventDefectSpec | None = Field(None, description="stuck, hot and flickering pixels; default none")
     readout_max_events_per_s: float | None = Field(
         None, ge=1e-3, le=1e12, description="events beyond are lost; default no limit"
@@ -205,6 +226,8 @@ class SheetEvsSpec(Strict):
                 "leak.process 'drift' moves the reference of asynchronous pixels, reference 'last_event'; a fixed tick "
                 "has process 'poisson'"
             )
+        if self.noise_spread is not None and self.reference != "last_event":
+            raise ValueError("noise_spread belongs to reference 'last_event'; noise of a fixed tick has no bandwidth")
         if (self.data_sheet or self.v2e) is not None and self.reference != "last_event":
             raise ValueError("data_sheet and v2e describe asynchronous pixels: they need reference 'last_event'")
         return self
@@ -248,6 +271,8 @@ class EvsSpec(SheetEvsSpec):
         if self.photoreceptor is not None and self.photoreceptor.filters_noise:
             if self.reference != "last_event":
                 raise ValueError("photoreceptor.filters_noise belongs to reference 'last_event'")
+            if self.noise_spread is not None:
+                raise ValueError("noise_spread and photoreceptor.filters_noise both set bandwidths: leave one out")
             if (self.photoreceptor_cutoff_hz or 0.0) > self.photoreceptor.cutoff_hz:
                 raise ValueError("photoreceptor_cutoff_hz is above photoreceptor.cutoff_hz, which filters the noise")
         if self.leak is not None and self.leak_rate_hz > 0:

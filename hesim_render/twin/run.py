@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hesim_render.calibrate.aps.long_series import long_series
 from hesim_render.calibrate.aps.pair_levels import both_levels, without_stuck
+from hesim_render.calibrate.aps.pairs import DARK_NOISE_LIMIT_DN, PairCalibration
 from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.pairs_output import calibrate_pairs
 from hesim_render.calibrate.aps.sensor_file import write_sensor
@@ -97,12 +98,25 @@ def make_twin(
         checks = compare(result, held, real, twin)
         own_findings = findings(result)
         if result.dark_noise_is_rounded_off:
-            text = "rounding hides the dark noise, which follows from lit levels alone: no dark frames are compared"
+            text = _under_rounding(result)
             own_findings.append(Finding("twin", text, None))
         (folder.path / RESULT_NAME).write_text(_json(checks, seed), encoding="utf-8")
         texts = [finding.text for finding in own_findings]
         (folder.path / "twin.html").write_text(page(checks, texts), encoding="utf-8")
     return Twin(folder.target, checks, own_findings)
+
+
+def _under_rounding(result: PairCalibration) -> str:
+    """What a twin can tell in the dark where rounding hides the noise."""
+    noise = result.rounded_noise
+    if noise is None:
+        limit = f"at most {DARK_NOISE_LIMIT_DN} DN, which is not compared"
+        return f"rounding hides the dark noise: no grey value changes in the dark, so that it is {limit}"
+    interval = f"{noise.value:.3g} DN ({noise.low:.3g} to {noise.high:.3g})"
+    return (
+        f"rounding hides the variance of the dark noise: by the probabilities of grey values it is {interval}, and "
+        "nothing else is compared in the dark"
+    )
 
 
 def _json(checks: list[Check], seed: int) -> str:

@@ -1,5 +1,6 @@
 """EMVA 1288 sets in the forms of other makers: the same frames give the same figures, and the truth's."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -216,8 +217,10 @@ def test_of_several_long_series_that_at_half_of_saturation_is_used(tmp_path):
     assert {half.spatial_lit.exposure_s for half in halves} == {result.pairs.spatial_lit.exposure_s}
 
 
-def test_rounding_that_hides_the_dark_noise_leaves_a_limit(tmp_path):
-    """EMVA 1288 R4.0: below a measured variance of 0.24 DN² σ_d is below 0.49 DN; K and the efficiency are found."""
+def test_rounding_that_hides_the_dark_noise_leaves_grey_values(tmp_path):
+    """EMVA 1288 R4.0: below a measured variance of 0.24 DN² σ_d is below 0.49 DN; K and the efficiency are found. The
+    chances of grey values tell the noise, 0.26 DN.
+    """
     camera = NARROW_CAMERA.but(gain=0.041, read_noise=6.3, row_noise=0.02, dark_current=900.0)
     folder = Maker().write(tmp_path / "set", series_of(camera, 26), 8, (42, 58))
     result = evaluate(read_pair_set(folder))
@@ -225,12 +228,21 @@ def test_rounding_that_hides_the_dark_noise_leaves_a_limit(tmp_path):
     found = content(result)
     assert holds(found["K"], camera.gain) and holds(found["quantum_efficiency"], camera.efficiency)
     for name in ("read_noise_e", "temporal_dark_noise_e"):
-        assert found[name]["value"] is None and found[name]["upper_limit"] == pytest.approx(0.49 / 0.041, rel=0.05)
-        assert found[name]["upper_limit"] > camera.read_noise
+        assert holds(found[name], camera.read_noise) and found[name]["standard_error"] < 0.1 * camera.read_noise
+        assert "grey values" in found[name]["note"]
+    assert found["read_noise_e"]["value_dn"] == pytest.approx(0.258, rel=0.1)
+    # one whose grey values change in no frame has a limit
+    still = dataclasses.replace(result)
+    still.__dict__["rounded_noise"] = None
+    for name in ("read_noise_e", "temporal_dark_noise_e"):
+        entry = content(still)[name]
+        assert entry["value"] is None and entry["upper_limit"] == pytest.approx(0.49 / 0.041, rel=0.05)
+        assert "at most 0.49 DN" in entry["reason"]
     assert any("rounding hides the dark noise" in f["text"] for f in found["findings"])
     entries = frame_figures(folder).entries
-    for name in ("threshold_e", "threshold_photons", "dynamic_range"):
-        assert "the dark noise is not known: rounding hides it" in entries[name]["reason"]
+    # the standard's threshold has the ADC's 1/12 DN² and half an electron besides
+    expected = np.hypot(found["temporal_dark_noise_e"]["value"], np.sqrt(1 / 12) / found["K"]["value"]) + 0.5
+    assert entries["threshold_e"]["value"] == pytest.approx(expected)
 
 
 def test_a_dark_variance_above_the_limit_of_the_standard_has_a_value(tmp_path):

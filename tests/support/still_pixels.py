@@ -69,6 +69,46 @@ def target_events(rng, theta_on, theta_off, rise, *, hz, cycles, shape, sigma=0.
     return _events(found, shape[1])
 
 
+def noisy_target_events(rng, theta_on, theta_off, rise, *, hz, rests, cycles, shape, sigma, cutoff_hz, drift=0.0):
+    """Events of pixels that see bars pass by: the logarithm of the light rises, rests, falls and rests.
+
+    Parameters
+    ----------
+    rests : parts of a cycle for which the light rests at its top and at its bottom; it rises and falls equally long.
+    sigma : of the noise in the dark and in the bright light; it has two equal poles of corner `cutoff_hz`.
+    """
+    pole = 2 * np.pi * cutoff_hz / np.sqrt(np.sqrt(2) - 1)
+    steps, size = max(round(16 * cutoff_hz / hz), 200), theta_on.size
+    dt = 1 / (hz * steps)
+    h = pole * dt
+    move = np.exp(-h) * np.array([[1 + h, h], [-h, 1 - h]])
+    fresh = np.linalg.cholesky(np.eye(2) - move @ move.T)
+    ramp = (1 - sum(rests)) / 2
+    turns = np.cumsum([0.0, ramp, rests[0], ramp, rests[1]])
+    phase, state = rng.random(size), rng.standard_normal((2, size))
+    # any place of the thresholds' ladder is as likely
+    reference, before = rise / 2 + theta_on * rng.random(size), np.full(size, rise / 2)
+    found = [(np.empty(0, int), np.empty(0, int), np.empty(0, int))]
+    for k in range(-2 * steps, cycles * steps):
+        state = move @ state + fresh @ rng.standard_normal(state.shape)
+        part = np.interp((k / steps + phase) % 1, turns, [0.0, 1.0, 1.0, 0.0, 0.0])
+        level = rise * part + (sigma[0] + (sigma[1] - sigma[0]) * part) * state[0]
+        reference = reference - drift * dt
+        for sign, theta in ((1, theta_on), (-1, theta_off)):
+            count = np.maximum(np.floor(sign * (level - reference) / theta), 0).astype(int)
+            some = np.flatnonzero(count)
+            if k >= 0 and some.size:
+                pixel = np.repeat(some, count[some])
+                number = np.arange(1, pixel.size + 1) - np.repeat(np.cumsum(count[some]) - count[some], count[some])
+                goal = reference[pixel] + sign * number * theta[pixel]
+                way = level[pixel] - before[pixel]
+                place = np.clip((goal - before[pixel]) / np.where(way == 0, np.inf, way), 0, 1)
+                found.append((np.ceil((k + place) * dt * 1e6).astype(int) + 1, pixel, np.full(pixel.size, sign)))
+            reference = reference + sign * count * theta
+        before = level
+    return _events(found, shape[1])
+
+
 def random_events(rng, rate_hz, dead_us, *, seconds, shape):
     """Events of pixels [pixel] that fire at random after a dead time of any real number of µs."""
     found = [(np.empty(0, int), np.empty(0, int), np.empty(0, int))]

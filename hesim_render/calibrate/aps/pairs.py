@@ -7,7 +7,8 @@ columns get anew in each frame, because a twin of the sensor needs them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +32,10 @@ from hesim_render.calibrate.aps.pairs_required import (
     require_series_below_well,
     require_steady_light,
 )
+from hesim_render.calibrate.aps.rounded_noise import RoundedNoise, rounded_noise
 from hesim_render.calibrate.aps.spatial import Pattern, outliers, pattern_of
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance
+from hesim_render.calibrate.estimate import Z_95
 from hesim_render.calibrate.moments import Progress
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import require_memory
@@ -117,6 +120,13 @@ class PairCalibration:
         """Whether rounding hides the dark noise (EMVA 1288 R4.0: a measured variance below 0.24 DN²)."""
         return bool(np.min(self.dark.variance + np.maximum(self.dark.row, 0.0)) < _LEAST_DARK_DN2)
 
+    @cached_property
+    def rounded_noise(self) -> RoundedNoise | None:
+        """Dark noise from the probabilities of grey values where rounding hides its variance; None where nothing does
+        or none changes.
+        """
+        return rounded_noise(self.long_dark, self.defects) if self.dark_noise_is_rounded_off else None
+
     @property
     def light(self) -> NDArray[np.float64]:
         """Light of each level: photons per pixel, or the exposure in s where photons are not stated."""
@@ -200,11 +210,12 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     light_pattern = pattern_of(relative, relative_noise)
     defects = outliers(long_dark.mean, long_dark.spatial.noise) | outliers(relative, relative_noise)
     defects |= np.any(stuck_pixels(pairs.spec.full_scale_dn, long_dark, long_lit), axis=0)
-    return PairCalibration(
+    result = PairCalibration(
         pairs, lit, dark, signal, saturation, clear, gain, responsivity, black, noise, curve, fit, bins, level_chi2,
         level_chance, level_rms, row, col, linearity_error(light[clear], signal[clear], top), long_dark, long_lit,
         dark_pattern, light_pattern, defects,
     )  # fmt: skip
+    return replace(result, fit=_with_dark_noise(result))
 
 
 def _saturation(lit: Levels) -> int:
@@ -291,6 +302,21 @@ def _widened(fit: VarianceFit, level_chi2: float) -> VarianceFit:
     """The fit with errors that include that whole levels, not only pixels, scatter about the polynomial."""
     values = {name: getattr(fit, name) for name in VarianceFit.__dataclass_fields__}
     return VarianceFit(**{**values, "covariance": fit.covariance * max(level_chi2, 1.0)})
+
+
+def _with_dark_noise(result: PairCalibration) -> VarianceFit:
+    """The fit with the dark noise that grey values tell where no dark variance could be used."""
+    noise, fit = result.rounded_noise, result.fit
+    if noise is None:
+        return fit
+    line = np.array([1.0, 0.0, result.pairs.spatial_dark.exposure_s, 0.0, 0.0, 0.0]) * fit.identified
+    shared = sum(max(value, 0.0) for value, _ in (result.row, result.col))
+    error = 2 * noise.value * (noise.high - noise.low) / (2 * Z_95)
+    own = error**2 + result.row[1] ** 2 + result.col[1] ** 2
+    gain = fit.covariance @ line / (line @ fit.covariance @ line + own)
+    beta = fit.beta + gain * (noise.value**2 - shared - line @ fit.beta)
+    covariance = fit.covariance - np.outer(gain, line @ fit.covariance)
+    return replace(fit, beta=beta, covariance=covariance)
 
 
 def _relative(

@@ -14,6 +14,7 @@ from hesim_render.calibrate.aps.long_series import Long, stuck_pixels
 from hesim_render.calibrate.aps.pair_levels import WELL_SHARE
 from hesim_render.calibrate.aps.pairs import DARK_NOISE_LIMIT_DN, PairCalibration, evaluate
 from hesim_render.calibrate.aps.pairs_findings import SIGNIFICANT, findings
+from hesim_render.calibrate.aps.rounded_noise import levels_of
 from hesim_render.calibrate.aps.variance import TERMS
 from hesim_render.calibrate.estimate import Z_95, estimated, not_identifiable
 from hesim_render.calibrate.moments import Progress
@@ -22,6 +23,8 @@ from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, polynomial
 from hesim_render.recording.pair_set import PairSet, read_pair_set
 
 _FIGURE_PX = 320
+#: Relative error of a noise that rounding hides, up to which it has a value.
+_LEAST_KNOWN = 0.25
 
 
 def calibrate_pairs(
@@ -155,24 +158,44 @@ def _quantum_efficiency(result: PairCalibration, relative: float) -> dict[str, A
 def _read_noise(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
     """Of pixels alone, at no exposure: without the ADC and without what rows, columns and lines share."""
     if result.dark_noise_is_rounded_off:
-        return _upper_limit(k)
+        shared = sum(max(value, 0.0) for value, _ in (result.row, result.col)) + result.lines_dn2
+        current = max(result.black.slope, 0.0) * k * result.pairs.spatial_dark.exposure_s
+        return _rounded(result, k, relative, shared + current)
     variance = result.noise.value - result.lines_dn2 - ADC_VARIANCE_DN2
     noise = float(np.sqrt(variance))
     error = float(np.hypot(result.noise.error / (2 * variance), relative))
     return estimated(noise / k, noise / k * error, "e-", result.noise.groups) | {"value_dn": noise}
 
 
-def _upper_limit(k: float) -> dict[str, Any]:
-    """The standard's limit where rounding hides the noise."""
-    return not_identifiable("rounding hides it; capture with more bits or a higher gain") | {
-        "upper_limit": DARK_NOISE_LIMIT_DN / k, "unit": "e-",
-    }  # fmt: skip
+def _rounded(result: PairCalibration, k: float, relative: float, other_dn2: float) -> dict[str, Any]:
+    """Noise without a variance of its own, by the grey values of the long dark series; else its limit.
+
+    Parameters
+    ----------
+    result : of the captures.
+    k, relative : gain, DN/e⁻, and its relative error.
+    other_dn2 : variance of that series that is not of this noise, DN².
+    """
+    noise = result.rounded_noise
+    limit = DARK_NOISE_LIMIT_DN if noise is None else min(DARK_NOISE_LIMIT_DN, noise.high)
+    if noise is not None and noise.low**2 > other_dn2:
+        low, value, high = (float(np.sqrt(v**2 - other_dn2)) for v in (noise.low, noise.value, noise.high))
+        error = (high - low) / (2 * Z_95)
+        if error < _LEAST_KNOWN * value:
+            entry = estimated(value / k, value / k * float(np.hypot(error / value, relative)), "e-")
+            low, high = (v / k * (1 + sign * Z_95 * relative) for sign, v in ((-1, low), (1, high)))
+            note = "by the probabilities of grey values, as rounding hides its variance"
+            return entry | {"interval_95": [low, high], "value_dn": value, "note": note}
+    return not_identifiable(
+        f"rounding to whole grey values hides it: it is at most {limit:.2g} DN; capture with more bits or a higher gain"
+    ) | {"upper_limit": limit / k, "unit": "e-"}  # fmt: skip
 
 
 def _dark_noise(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
     """The standard's σ_d, with what rows and columns share."""
     if result.dark_noise_is_rounded_off:
-        return _upper_limit(k)
+        current = max(result.black.slope, 0.0) * k * result.pairs.spatial_dark.exposure_s
+        return _rounded(result, k, relative, current)
     variance = result.noise.value - ADC_VARIANCE_DN2 + max(result.row[0], 0.0) + max(result.col[0], 0.0)
     error = float(np.sqrt(result.noise.error**2 + result.row[1] ** 2 + result.col[1] ** 2)) / (2 * variance)
     noise = float(np.sqrt(variance)) / k
@@ -270,6 +293,11 @@ def maps(result: PairCalibration) -> dict[str, NDArray]:
     shading = result.light_pattern.shading()
     step = max(1, -(-max(shape) // _FIGURE_PX))
     offset = result.dark_pattern.col + result.dark_pattern.pixel
+    if result.rounded_noise is not None:
+        spread = result.rounded_noise.spread
+        offset = levels_of(result.long_dark.mean, ~result.defects, spread) - np.reshape(
+            result.dark_pattern.row, (-1, 1)
+        )
     response = np.maximum((1 + result.light_pattern.whole) / (1 + shading), 0.0)
     full = result.pairs.spec.full_scale_dn
     # beyond the range, so that no noise leads out of its ends

@@ -18,6 +18,8 @@ SLICES, GROUPS = 20, 20
 LONG_US = 20_000
 #: Windows in which the load of the read-out is counted, µs.
 WINDOW_US = 1000
+#: Steps of the logarithmic histograms of a moving target's intervals in a factor of two, from 1 µs, and their number.
+STEPS_PER_OCTAVE, STEPS = 32, 32 * 26
 #: Lamps on alternating current flicker with twice its frequency.
 LAMPS_HZ = (100.0, 120.0)
 #: Times between turns that are kept.
@@ -45,6 +47,8 @@ class EventTally:
     waves : [frequency, slice of the time], complex sums of the ON events' phases at each of `LAMPS_HZ`.
     used : [pixel], pixels that rates, their spread and the local variation are taken of; all, but for hot ones.
     windows : [k], number of windows of `WINDOW_US` that hold k events; windows without events are left out.
+    same, gaps : [first polarity, group of pixels, step], intervals between successive events of a pixel of the same
+        polarity, and of different ones, in logarithmic steps.
     turns_us : first times between successive turns of a pixel from OFF to ON events, at most `TURNS`.
     """
 
@@ -60,6 +64,8 @@ class EventTally:
     windows: NDArray[np.int64] = field(init=False)
     waves: NDArray[np.complex128] = field(init=False)
     used: NDArray[np.bool_] = field(init=False)
+    same: NDArray[np.int64] = field(init=False)
+    gaps: NDArray[np.int64] = field(init=False)
     turns_us: list[NDArray[np.int64]] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -68,6 +74,7 @@ class EventTally:
         self.intervals, self.windows = np.zeros(LONG_US + 1, np.int64), np.zeros(1, np.int64)
         self.variation, self.pairs = np.zeros(pixels), np.zeros(pixels, np.int64)
         self.waves, self.used = np.zeros((len(LAMPS_HZ), SLICES), np.complex128), np.ones(pixels, np.bool_)
+        self.same, self.gaps = np.zeros((2, 2, GROUPS, STEPS), np.int64)
         self.turns_us, self._turns, self._turn_us = [], 0, np.full(pixels, -1, np.int64)
         # group of each pixel: neighbours and columns are spread over all groups
         self.group = (np.arange(pixels, dtype=np.uint64) * np.uint64(2654435761) >> np.uint64(16)) % np.uint64(GROUPS)
@@ -103,6 +110,7 @@ class EventTally:
         known = before_us >= 0
         self.intervals += np.bincount(np.minimum((t_us - before_us)[known], LONG_US), minlength=LONG_US + 1)
         was_on = np.where(first, self._last_on[pixel], np.append(False, on[:-1]))
+        self._successions(known, was_on, on, pixel, t_us - before_us)
         turn = known & on & ~was_on
         self._take_turns(pixel[turn], t_us[turn])
         self._last_us[0, pixel[last]], self._last_on[pixel[last]] = t_us[last], on[last]
@@ -127,6 +135,16 @@ class EventTally:
         self.variation += np.bincount(pixel[both], 3 * ((a - b) / (a + b)) ** 2, self.pixels)
         self.pairs += np.bincount(pixel[both], minlength=self.pixels)
         self._last_us[1, pixel[last]], self._interval_us[pixel[last]] = t_us[last], interval[last]
+
+    def _successions(
+        self, known: NDArray[np.bool_], was_on: NDArray, on: NDArray, pixel: NDArray[np.int64], interval_us: NDArray
+    ) -> None:
+        step = np.log2(np.maximum(interval_us[known], 1)) * STEPS_PER_OCTAVE
+        place = self.group[pixel[known]].astype(np.int64) * STEPS + np.minimum(step.astype(np.int64), STEPS - 1)
+        place += np.where(was_on[known], 0, GROUPS * STEPS)
+        is_same = was_on[known] == on[known]
+        for total, chosen in ((self.same, is_same), (self.gaps, ~is_same)):
+            total += np.bincount(place[chosen], minlength=total.size).reshape(total.shape)
 
     def _take_turns(self, pixel: NDArray[np.int64], t_us: NDArray[np.int64]) -> None:
         if pixel.size == 0 or self._turns >= TURNS:

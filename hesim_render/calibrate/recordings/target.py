@@ -4,7 +4,8 @@ Each pixel sees its light rise and fall by Δ = ln(bright/dark) again and again.
 own thresholds. It turns back up to a threshold before the light does, so that its ON events in a cycle are fewer than
 Δ/θ₊ by a number that depends on where it turns. The counts of pixels with given thresholds are therefore simulated, and
 θ₊, θ₋ and their spread are those whose mean counts and scatter over pixels are the measured ones. The light must change
-slowly enough for the pixels, and noise must be small against the thresholds.
+slowly enough for the pixels, and noise must be small against the thresholds. Where the light rests at its top and its
+bottom, noise carries the level further than the light; by how much is read from late events (`rests`).
 """
 
 from __future__ import annotations
@@ -16,11 +17,14 @@ from numpy.typing import NDArray
 from scipy import special
 
 from hesim_render.calibrate.estimate import estimated, not_identifiable
+from hesim_render.calibrate.recordings.rests import overshoots, rests
 from hesim_render.calibrate.recordings.still import UNSURE_LEAK, jackknife
 from hesim_render.calibrate.recordings.tally import GROUPS, EventTally
 
 #: Simulated pixels, cycles before their counts begin, and most cycles that are simulated.
 _PIXELS, _WARM, _MOST_CYCLES = 8192, 4, 60
+#: Standard errors in half of an interval of 95 %.
+_TWO_SIDED_95 = 1.96
 #: Cycles, and ON and OFF events a cycle, that are needed.
 _LEAST_CYCLES, _LEAST_EVENTS = 3, 1.5
 
@@ -56,16 +60,19 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     period_s = 1 / cycles_hz if cycles_hz is not None else tally.period_s()
     cycles = tally.seconds / period_s if period_s is not None else 0.0
     count = count[:, seen]
-    leaked = leak_hz * tally.seconds  # in thresholds of ON events
-    share = np.array([[-0.5], [0.5 * count[1].mean() / max(count[0].mean() - leaked, 1.0)]])
-    unsure = UNSURE_LEAK * np.abs(share[:, 0] * leaked) / count.mean(axis=1)
-    count = (count + share * leaked) / max(cycles, 1e-300)
+    means = count.mean(axis=1)
+    ratio = max(means[0] - leak_hz * tally.seconds, 1.0) / means[1]
+    count = count / max(cycles, 1e-300)
     if cycles < _LEAST_CYCLES or count.mean(axis=1).min() < _LEAST_EVENTS:
         return unknown(
             f"a pixel sees {cycles:.3g} cycles of the target, with {count.mean(axis=1).min() if cycles else 0:.3g} "
             f"events of a polarity in each; {_LEAST_CYCLES} cycles of {_LEAST_EVENTS} events are needed"
         )
-    simulated = _Simulated(float(np.log(contrast)), round(min(cycles, _MOST_CYCLES)))
+    assert period_s is not None
+    course = _course(tally, leak_hz, period_s, ratio)
+    unsure = course.unsure * np.array([1.0, 1 / ratio]) / count.mean(axis=1)
+    rise = float(np.log(contrast))
+    simulated = _Simulated(rise, round(min(cycles, _MOST_CYCLES)), course)
     group = tally.group.astype(np.int64)[seen]
     whole = _moments(count)
     parts = np.array([_moments(count[:, group != k]) for k in range(GROUPS)])
@@ -75,10 +82,14 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     of_simulated = simulated.moment_covariance(fitted)
     inverse = np.linalg.inv(slope)
     of_simulated = inverse @ of_simulated @ inverse.T
-    errors = np.sqrt(jackknife(every) ** 2 + np.diag(of_simulated) + (fitted * np.append(unsure, 0.0)) ** 2)
+    # the swing of the level is that of the light and both overshoots, of which one bandwidth is not known
+    swing = rise + course.top.mean() * fitted[0] + course.bottom.mean() * fitted[1]
+    over = course.ends @ fitted[:2] / swing
+    beside = fitted * np.append(unsure, 0.0)
+    errors = np.sqrt(jackknife(every) ** 2 + np.diag(of_simulated) + beside**2)
     entries = {
-        "theta_on": estimated(fitted[0], errors[0], "ln", GROUPS),
-        "theta_off": estimated(fitted[1], errors[1], "ln", GROUPS),
+        name: _widened(estimated(value, error, "ln", GROUPS), over)
+        for name, value, error in zip(("theta_on", "theta_off"), fitted[:2], errors[:2], strict=True)
     }
     if fitted[2] > 2 * errors[2]:
         spread = float(np.sqrt(fitted[2]))
@@ -88,10 +99,52 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
             "value": 0.0, "upper_limit": float(np.sqrt(max(fitted[2], 0.0) + 2 * errors[2])),
             "note": "the pixels scatter no more than the place of their turns makes them",
         }  # fmt: skip
-    ratio = every[1] / every[0]
+    ratios = every[1] / every[0]
     away = np.array([-1 / fitted[0], 1 / fitted[1], 0.0])  # slope of ln ρ
-    error = float(np.sqrt(jackknife(ratio) ** 2 + ratio[0] ** 2 * (unsure.sum() ** 2 + away @ of_simulated @ away)))
-    return TargetThresholds(entries, estimated(ratio[0], error, "", GROUPS))
+    error = float(np.sqrt(jackknife(ratios) ** 2 + ratios[0] ** 2 * (unsure.sum() ** 2 + away @ of_simulated @ away)))
+    return TargetThresholds(entries, estimated(ratios[0], error, "", GROUPS))
+
+
+def _widened(entry: dict[str, Any], over: NDArray[np.float64]) -> dict[str, Any]:
+    """An estimate with an interval that also holds what is not known of the overshoots, relative, down and up."""
+    value, half = entry["value"], np.abs(np.array(entry["interval_95"]) - entry["value"])
+    below, above = np.hypot(half, over * value)
+    error = float(below + above) / (2 * _TWO_SIDED_95)
+    return {**entry, "standard_error": error, "interval_95": [float(value - below), float(value + above)]}
+
+
+class _Course(NamedTuple):
+    """What the level of a pixel does beside the light, in thresholds: θ₊ at the top, θ₋ at the bottom.
+
+    Parameters
+    ----------
+    top, bottom : overshoot of the level at each rest, [pixel].
+    drifts : of the reference from the begin of the top to that of the bottom, and on to the next top, in θ₊.
+    unsure : what is not known of the drift, in θ₊ a cycle.
+    ends : how far the interval of the mean of each overshoot goes down and up from it, [2, top and bottom].
+    """
+
+    top: NDArray[np.float64]
+    bottom: NDArray[np.float64]
+    drifts: tuple[float, float]
+    unsure: float
+    ends: NDArray[np.float64]
+
+
+def _course(tally: EventTally, leak_hz: float, period_s: float, ratio: float) -> _Course:
+    """Overshoots by what comes late at the rests of the light; light without rests turns without any."""
+    both = rests(tally, leak_hz, ratio)
+    if both is None:
+        none, half = np.zeros(_PIXELS), 0.5 * leak_hz * period_s
+        return _Course(none, none, (half, half), UNSURE_LEAK * half, np.zeros((2, 2)))
+    top, bottom = overshoots(*both, _PIXELS)
+    ramp_s = 0.5 * max(period_s - both[0].ramps.rest_s - both[1].ramps.rest_s, 0.0)
+    leaks = top.drift, -bottom.drift * ratio
+    ramp_leak_hz = 0.5 * (leaks[0] + leaks[1])
+    drifts = [own * rest.ramps.rest_s + ramp_leak_hz * ramp_s for own, rest in zip(leaks, both, strict=True)]
+    unsure = 0.5 * (top.drift_error * both[0].ramps.rest_s + bottom.drift_error * ratio * both[1].ramps.rest_s)
+    ends = np.array([[one.mean - one.low, one.high - one.mean] for one in (top, bottom)]).T
+    return _Course(top.quantiles, bottom.quantiles, (drifts[0], drifts[1]), unsure, ends)
 
 
 def unknown(reason: str) -> TargetThresholds:
@@ -107,15 +160,23 @@ def _moments(count: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class _Simulated:
-    """Counts of pixels whose light rises and falls by `rise`, ln units."""
+    """Counts of pixels whose light rises and falls by `rise`, ln units, and rests in between.
 
-    def __init__(self, rise: float, cycles: int) -> None:
-        self._rise, self._cycles = rise, cycles
+    Parameters
+    ----------
+    rise : logarithm of the contrast.
+    cycles : that are counted.
+    course : rests, overshoots and drift.
+    """
+
+    def __init__(self, rise: float, cycles: int, course: _Course) -> None:
+        self._rise, self._cycles, self._course = rise, cycles, course
         rng = np.random.default_rng(1)
         # even steps of each law in random order: a sample would have a mean of its own
         place = (np.arange(_PIXELS) + 0.5) / _PIXELS
         self._z = np.array([special.ndtri(rng.permutation(place)) for _ in range(2)])
         self._start = rng.permutation(place)
+        self._over = [[rng.permutation(one) for _ in range(_WARM + cycles)] for one in (course.top, course.bottom)]
 
     def moments(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """`_moments` of θ₊, θ₋ and the variance of the relative mismatch."""
@@ -133,11 +194,13 @@ class _Simulated:
         spread = np.sqrt(max(values[2], 0.0))
         theta = np.maximum(values[:2, None] * (1 + spread * self._z), 0.05 * values[:2, None])
         reference, count = self._start * self._rise, np.zeros((2, _PIXELS))
+        to_bottom, to_top = (values[0] * part for part in self._course.drifts)
         for cycle in range(_WARM + self._cycles):
-            up = np.maximum(np.floor((self._rise - reference) / theta[0] + 1e-9), 0.0)
-            reference = reference + up * theta[0]
-            down = np.maximum(np.floor(reference / theta[1] + 1e-9), 0.0)
-            reference = reference - down * theta[1]
+            top, bottom = (self._over[k][cycle] * values[k] for k in range(2))
+            up = np.maximum(np.floor((self._rise + top - reference) / theta[0] + 1e-9), 0.0)
+            reference = reference + up * theta[0] - to_bottom
+            down = np.maximum(np.floor((reference + bottom) / theta[1] + 1e-9), 0.0)
+            reference = reference - down * theta[1] - to_top
             if cycle >= _WARM:
                 count += np.stack([up, down])
         return count / self._cycles

@@ -66,7 +66,7 @@ class EvsNoise(PlainState):
     def without(self, *terms: str) -> EvsNoise:
         """The same model with terms of `EVS_TERMS` switched off.
 
-        ``shot`` is β3, ``dark_current`` is β4 (its shot noise), ``mismatch`` the spread of thresholds,
+        ``shot`` is β3, ``dark_current`` is β4 (its shot noise), ``mismatch`` the spread over pixels,
         ``leak`` the leak, ``bandwidth`` the photoreceptor's low-pass, ``refractory`` the dead time after
         an event, ``readout_limit`` the loss of events in the read-out, ``crosstalk`` the light from neighbouring
         pixels, ``comparator_noise`` the events of the comparators' own noise, ``stuck``, ``hot`` and ``flickering``

@@ -18,6 +18,7 @@ from hesim_render.core.rng import Stream, normal_pair, philox, stream_key
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.formulas import POLE
 from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.evs.noise_spread import bandwidth_map, most_bandwidth
 from hesim_render.pixels.evs.photoreceptor import Photoreceptor
 
 #: Nodes of the noise per period of the photoreceptor's cut-off frequency.
@@ -35,8 +36,9 @@ class BandNoise:
     The state (u, u'/a) steps from node to node with its exact transition matrix. Between nodes the interpolated
     variance averages (2 + ρ)/3, with ρ the correlation of neighbouring nodes. The amplitude is scaled to compensate.
 
-    Where the photoreceptor filters the noise, a is at most its rate at each node, one per pixel. In the units of the
-    state the stationary law is the same for every a, so that the variance stays 1 while a changes.
+    Pixels of unlike bandwidths have nodes at the same times, those of the largest one. Where the photoreceptor filters
+    the noise, a is at most its rate at each node, one per pixel. In the units of the state the
+    stationary law is the same for every a, so that the variance stays 1 while a changes.
 
     Parameters
     ----------
@@ -51,7 +53,7 @@ class BandNoise:
         cutoff_hz = noise.spec.photoreceptor_cutoff_hz
         assert cutoff_hz is not None
         self._key, self._seed = noise.on_device.key, seed
-        self._period_us = US_PER_S / (NODES_PER_CUTOFF_PERIOD * cutoff_hz)
+        self._period_us = US_PER_S / (NODES_PER_CUTOFF_PERIOD * cutoff_hz * most_bandwidth(noise))
         h = POLE / NODES_PER_CUTOFF_PERIOD  # a·period
         self._transition = math.exp(-h) * np.array([[1.0 + h, h], [-h, 1.0 - h]])
         self._amplitude = math.sqrt(3.0 / (2.0 + (1.0 + h) * math.exp(-h)))
@@ -59,7 +61,10 @@ class BandNoise:
         fresh = np.eye(2) - self._transition @ self._transition.T
         self._fresh = self._amplitude * np.linalg.cholesky(fresh)
         self._photoreceptor, self._largest = photoreceptor, h
-        if photoreceptor is not None:
+        own = bandwidth_map(noise)
+        self._own: Float = None if own is None else jit().Float(h * own / np.float32(most_bandwidth(noise)))
+        self._is_alike = photoreceptor is None and own is None
+        if not self._is_alike:
             self._amplitude = 1.0  # each pixel has its own, see `_scale`
         self._node = 0  # the last node at or before the present
         self._value: Float = None  # u at that node
@@ -76,7 +81,7 @@ class BandNoise:
 
         self._value, speed = self._state
         z = self._deviates(self._node + 1)
-        if self._photoreceptor is not None:
+        if not self._is_alike:
             self._state = _step(self._value, speed, self._angle(), z)
             dr.schedule(self._state)
             return
@@ -103,7 +108,7 @@ class BandNoise:
 
     def share(self, pixels: int) -> NDArray[np.float64]:
         """Bandwidth of each pixel's noise over the largest, [pixels]."""
-        if self._photoreceptor is None:
+        if self._is_alike:
             return np.ones(pixels)
         return np.broadcast_to(np.asarray(self._angle(), np.float64) / self._largest, pixels)
 
@@ -128,12 +133,14 @@ class BandNoise:
             part = max(t_us / self._period_us - self._node, 0.0)
         # a line between nodes
         value = dr.fma(self._state[0] - self._value, dr.opaque(jit().Float, part), self._value)
-        return value if self._photoreceptor is None else value * self._scale()
+        return value if self._is_alike else value * self._scale()
 
     def _angle(self) -> Float:
         """h = a·period of each pixel."""
         import drjit as dr
 
+        if self._own is not None:
+            return self._own
         assert self._photoreceptor is not None
         return dr.minimum(self._photoreceptor.noise_rate_per_us * self._period_us, self._largest)
 

@@ -40,6 +40,7 @@ from hesim_render.core.rng import Stream, random_words, uniform
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.formulas import POLE
 from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.evs.noise_spread import most_bandwidth
 
 #: Grid of levels, in standard deviations.
 _STEP = 0.1
@@ -228,6 +229,7 @@ def start_of(
     # what resets a pixel besides its events, and for how long it is dead after one
     bandwidth_hz, period_us = noise.spec.photoreceptor_cutoff_hz, noise.refractory_period_us
     assert bandwidth_hz is not None
+    bandwidth_hz *= most_bandwidth(noise)
     dead_s = (period_us or 0) / US_PER_S
     resets_hz = 1 / _LONG_S + (noise.resets_hz if period_us else 0.0)
     octaves = np.unique(np.concatenate([whole, whole[octave > whole] + 1]))

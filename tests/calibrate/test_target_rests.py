@@ -1,0 +1,156 @@
+"""Thresholds from a moving target whose light rests between its turns, where noise lets the level go further than the
+light: against noise written in NumPy, on six sensors and a hundred more (`tests/support/still_pixels.py`).
+"""
+
+import numpy as np
+import pytest
+
+from hesim_render.calibrate.recordings import rests, target
+from hesim_render.calibrate.recordings.tally import tally
+from hesim_render.exchange import EventStream
+from tests.support.still_pixels import noisy_target_events
+
+SIDE = 20
+#: θ₊, θ₋/θ₊, mismatch, noise in the dark and in the bright light over θ₊, its corner in Hz, leak in Hz, logarithm of
+#: the contrast, cycles a second, rests at the top and at the bottom in cycles.
+SIX = {
+    "quiet, leaks": (0.2, 1.0, 0.08, (1 / 14, 1 / 35), 300.0, 0.6, 2.08, 3.0, (0.45, 0.45)),
+    "slow noise": (0.25, 1.25, 0.12, (1 / 6, 1 / 9), 60.0, 0.1, 2.1, 2.0, (0.4, 0.35)),
+    "fast noise": (0.3, 0.8, 0.05, (1 / 8, 1 / 16), 1000.0, 0.3, 1.8, 5.0, (0.3, 0.4)),
+    "low thresholds": (0.15, 1.1, 0.1, (1 / 20, 1 / 25), 150.0, 0.05, 1.5, 4.0, (0.5, 0.3)),
+    "noise with events back": (0.22, 0.95, 0.15, (1 / 5, 1 / 8), 200.0, 1.0, 2.5, 6.0, (0.25, 0.25)),
+    "slow, no leak": (0.18, 1.3, 0.03, (1 / 10, 1 / 12), 40.0, 0.0, 2.0, 1.5, (0.35, 0.5)),
+}
+
+
+def a_sensor(seed):
+    """A sensor of its own for each seed, as those of `SIX`."""
+    rng = np.random.default_rng(seed)
+    bright = 1 / rng.uniform(10, 35)
+    return (
+        rng.uniform(0.15, 0.3), rng.uniform(0.8, 1.3), rng.uniform(0.05, 0.12), (bright * rng.uniform(1, 1.8), bright),
+        float(np.exp(rng.uniform(np.log(25), np.log(1600)))), rng.uniform(0, 0.6), rng.uniform(1.6, 2.5),
+        float(np.exp(rng.uniform(np.log(1.5), np.log(5)))), tuple(rng.uniform(0.25, 0.45, 2)),
+    )  # fmt: skip
+
+
+def recordings(of, seed, count):
+    """So many recordings of a sensor, each with thresholds of its own."""
+    theta_on, ratio, mismatch, noise, cutoff_hz, leak_hz, rise, hz, parts = of
+    rng = np.random.default_rng(seed)
+    z = rng.standard_normal((2, SIDE * SIDE * count))
+    on, off = theta_on * (1 + mismatch * z[0]), theta_on * ratio * (1 + mismatch * z[1])
+    events = noisy_target_events(
+        rng, on, off, rise, hz=hz, rests=parts, cycles=10, shape=(SIDE * count, SIDE),
+        sigma=tuple(theta_on * part for part in noise), cutoff_hz=cutoff_hz, drift=leak_hz * theta_on,
+    )  # fmt: skip
+    result = []
+    for k in range(count):
+        mine = events[events["y"] // SIDE == k].copy()
+        mine["y"] -= SIDE * k
+        result.append(tally(EventStream.of(mine, (SIDE, SIDE))))
+    return result
+
+
+def judged(of, tallies):
+    """Whether each interval holds the truth, and the relative error, for each recording."""
+    theta_on, ratio, mismatch, leak_hz, rise = *of[:3], of[5], of[6]
+    truth = {"theta_on": theta_on, "theta_off": theta_on * ratio, "threshold_mismatch_rel": mismatch}
+    outcome = []
+    for one in tallies:
+        found = target.thresholds(one, np.exp(rise), None, leak_hz)
+        entries = [(found.entries[name], value) for name, value in truth.items()] + [(found.ratio, ratio)]
+        outcome.append([
+            (entry.get("interval_95", [0.0, entry.get("upper_limit")])[0] <= value
+             <= entry.get("interval_95", [0.0, entry.get("upper_limit")])[1], entry["value"] / value - 1)
+            for entry, value in entries
+        ])  # fmt: skip
+    return np.array(outcome)  # [recording, figure, hit and error]
+
+
+@pytest.mark.parametrize(
+    ("cutoff_hz", "drift", "slopes", "rest_s"),
+    [(41.0, 0.0, (90.0, 130.0), 0.31), (41.0, 0.9, (70.0, 40.0), 0.17), (83.0, -0.7, (60.0, 95.0), 0.23)],
+)
+def test_the_highest_level_of_noise_is_that_of_simulated_noise(cutoff_hz, drift, slopes, rest_s):
+    """Mean and deviation at three times and after the rest, within 3 % (4 errors of 3000 paths are 2 %)."""
+    rng, sigma, size = np.random.default_rng(5), 0.13, 3000
+    pole = 2 * np.pi * cutoff_hz / np.sqrt(np.sqrt(2) - 1)
+    dt = 1 / (48 * cutoff_hz)
+    h = pole * dt
+    move = np.exp(-h) * np.array([[1 + h, h], [-h, 1 - h]])
+    fresh = np.linalg.cholesky(np.eye(2) - move @ move.T)
+    state, most = rng.standard_normal((2, size)), np.full(size, -9.0)
+    times, after = np.array([0.06, 0.3, 1.0]) * rest_s, []
+    waiting = [*times, np.inf]
+    for t in np.arange(-6 * sigma / slopes[0], rest_s + 6 * sigma / slopes[1], dt):
+        if t > waiting[0]:
+            after.append(most.copy())
+            waiting.pop(0)
+        state = move @ state + fresh @ rng.standard_normal(state.shape)
+        light = slopes[0] * min(t, 0.0) - slopes[1] * max(t - rest_s, 0.0) + drift * np.clip(t, 0.0, rest_s)
+        most = np.maximum(most, sigma * state[0] + light)
+    ramps = rests.Ramps(slopes, drift, rest_s)
+    laws = [
+        *rests.highest(np.array(sigma), np.array(cutoff_hz), ramps, times, False),
+        rests.highest(np.array(sigma), np.array(cutoff_hz), ramps, times[-1:], True)[0],
+    ]
+    for law, values in zip(laws, [*after, most], strict=True):
+        levels = sigma * rests._LEVELS
+        mean = levels[-1] - np.trapezoid(law, levels)
+        square = levels[-1] ** 2 - np.trapezoid(2 * levels * law, levels)
+        assert mean == pytest.approx(values.mean(), rel=0.03)
+        assert np.sqrt(square - mean**2) == pytest.approx(values.std(), rel=0.06)
+
+
+@pytest.mark.parametrize("name", ["low thresholds", "slow, no leak"])
+def test_noise_at_the_rests_does_not_lower_the_thresholds(name):
+    """Three recordings. Without the overshoots they are 2.3 and 3.9 % too low, four to twenty of their errors."""
+    outcome = judged(SIX[name], recordings(SIX[name], 1, 3))
+    assert outcome[:, :2, 0].all()
+    assert outcome[:, :2, 1].mean() > -0.01
+
+
+def test_rests_that_differ_from_pixel_to_pixel_are_not_used():
+    """Half of the pixels see each cycle in half of the time; light that turns at once has no rests either."""
+    of = SIX["low thresholds"]
+    whole = recordings(of, 2, 1)[0]
+    assert rests.rests(whole, of[5], of[1]) is not None
+    theta = np.full(SIDE * SIDE // 2, 0.2)
+    rng = np.random.default_rng(3)
+    keys = {"cycles": 8, "shape": (SIDE // 2, SIDE), "sigma": (0.01, 0.01), "cutoff_hz": 90.0}
+    slow, fast = (
+        noisy_target_events(rng, theta, theta, 2.0, hz=hz, rests=(0.4, 0.4), **keys | {"cycles": cycles})
+        for hz, cycles in ((3.0, 8), (6.0, 16))
+    )
+    fast["y"] += SIDE // 2
+    both = np.concatenate([slow, fast])
+    both = both[np.argsort(both["t_us"], kind="stable")]
+    assert rests.rests(tally(EventStream.of(both, (SIDE, SIDE))), 0.0, 1.0) is None
+    turns = noisy_target_events(rng, theta, theta, 2.0, hz=3.0, rests=(0.0, 0.0), **keys)
+    assert rests.rests(tally(EventStream.of(turns, (SIDE // 2, SIDE))), 0.0, 1.0) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SIX)
+def test_intervals_hold_the_truth_of_six_sensors(name):
+    """100 recordings each, on seeds that nothing was fitted on.
+
+    How far the noise carries the level follows from its bandwidth in part, which the recordings do not tell well: it
+    is one and the same in all recordings of a sensor, and in the interval. So the intervals of thresholds may hold
+    the truth in each of them; those of the ratio have no such part.
+    """
+    outcome = np.concatenate([judged(SIX[name], recordings(SIX[name], [20280101, k], 10)) for k in range(10)])
+    hits = outcome[..., 0].sum(axis=0)
+    assert hits[:2].min() >= 90 and hits[2:].min() >= 88, hits
+    assert abs(outcome[:, :2, 1].mean()) < 0.07
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth_of_a_hundred_sensors():
+    """Each with a bandwidth, a noise and a target of its own."""
+    outcome = np.concatenate([
+        judged(of, recordings(of, seed, 1)) for seed in range(20280301, 20280401) for of in (a_sensor(seed),)
+    ])  # fmt: skip
+    hits = outcome[..., 0].sum(axis=0)
+    assert np.all((hits >= 90) & (hits <= 99)), hits
