@@ -415,7 +415,10 @@ def every_section(kind=Strict):
 
 
 def test_what_must_be_more_than_a_limit_must_be_more_than_nothing():
-    """Strict lower limits of numbers in files are 0, but for angles above -45°; defaults lie within their limits."""
+    """Strict lower limits of numbers in files are 0, but for angles above -45° and relative figures above -1.
+
+    Defaults lie within their limits.
+    """
     strict, count = set(), 0
     for section in set(every_section()):
         for name, field in section.model_fields.items():
@@ -427,7 +430,7 @@ def test_what_must_be_more_than_a_limit_must_be_more_than_nothing():
                 where = f"{section.__name__}.{name}"
                 assert limits.get("gt", -math.inf) < field.default < limits.get("lt", math.inf), where
                 assert limits.get("ge", -math.inf) <= field.default <= limits.get("le", math.inf), where
-    assert strict <= {0, -45} and 0 in strict and count > 60
+    assert strict <= {0, -1, -45} and 0 in strict and count > 60
 
 
 def is_round(value):

@@ -109,7 +109,9 @@ def _widened(entry: dict[str, Any], over: NDArray[np.float64]) -> dict[str, Any]
     """An estimate with an interval that also holds what is not known of the overshoots, relative, down and up."""
     value, half = entry["value"], np.abs(np.array(entry["interval_95"]) - entry["value"])
     below, above = np.hypot(half, over * value)
-    error = float(below + above) / (2 * _TWO_SIDED_95)
+    # so many standard errors as in the interval without it
+    errors = half.mean() / entry["standard_error"] if entry["standard_error"] > 0 else _TWO_SIDED_95
+    error = float((below + above) / (2 * errors))
     return {**entry, "standard_error": error, "interval_95": [float(value - below), float(value + above)]}
 
 
