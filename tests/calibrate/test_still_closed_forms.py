@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from hesim_render.calibrate.estimate import estimated
 from hesim_render.calibrate.recordings import short_intervals, still, target
 from hesim_render.calibrate.recordings.short_intervals import readout_limit
 from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, SLICES, EventTally, tally
@@ -364,6 +365,20 @@ def test_a_tenth_of_the_leak_is_an_error_of_the_thresholds_of_a_target(monkeypat
     assert (spread["value"], spread["standard_error"]) == pytest.approx((0.3, 1e-3 / 0.6))
     ratio, relative = 0.34 / 0.21, np.sqrt(unsure.sum() ** 2 + (5e-3 / 0.21) ** 2 + (5e-3 / 0.34) ** 2)
     assert (found.ratio["value"], found.ratio["standard_error"]) == pytest.approx((ratio, ratio * relative))
+
+
+def test_what_is_not_known_of_overshoots_widens_either_end_by_itself():
+    """Squares of both are added at each end; the standard error grows as the mean of the ends."""
+    own = estimated(0.31, 0.004, "ln", 7)
+    half = 0.004 * stats.t.ppf(0.975, 6)
+    found = target._widened(own, np.array([0.02, 0.09]))
+    below, above = np.hypot(half, 0.02 * 0.31), np.hypot(half, 0.09 * 0.31)
+    assert found["interval_95"] == pytest.approx([0.31 - below, 0.31 + above])
+    assert found["standard_error"] == pytest.approx(0.004 * (below + above) / (2 * half))
+    exact = target._widened(estimated(0.31, 0.0, "ln", 7), np.array([0.02, 0.04]))
+    assert exact["standard_error"] == pytest.approx(0.03 * 0.31 / 1.959964)
+    unknown = estimated(np.nan, 0.004)
+    assert target._widened(unknown, np.array([0.1, 0.2])) == unknown
 
 
 def test_simulated_moments_have_the_covariance_of_their_groups():

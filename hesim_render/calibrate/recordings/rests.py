@@ -22,6 +22,7 @@ from scipy import special
 
 from hesim_render.calibrate.recordings.tally import STEPS_PER_OCTAVE, EventTally
 from hesim_render.core.units import S_PER_US
+from hesim_render.pixels.evs.formulas import POLE
 
 #: Levels over σ at which the law of the highest level is known.
 _LEVELS = np.linspace(-5.0, 8.0, 131)
@@ -110,7 +111,7 @@ def highest(noise: NDArray, cutoff_hz: NDArray, ramps: Ramps, times_s: NDArray, 
     times_s : since the begin of the rest, [time].
     is_over : the level has left the rest as well.
     """
-    sigma, pole = (np.asarray(v, np.float64)[..., None, None] for v in (noise, cutoff_hz * _POLE))
+    sigma, pole = (np.asarray(v, np.float64)[..., None, None] for v in (noise, cutoff_hz * POLE))
     t, u = np.asarray(times_s, np.float64)[:, None], _LEVELS
     drift = ramps.drift / sigma
     small = np.abs(drift * t) < 1e-3
@@ -124,10 +125,6 @@ def highest(noise: NDArray, cutoff_hz: NDArray, ramps: Ramps, times_s: NDArray, 
         end = np.where(small, 0.0, far)
         crossings = crossings + pole / after * _faster(-after / pole) * (beyond - _crossed(u - end))
     return np.asarray(special.ndtr(u) * np.exp(-crossings))
-
-
-#: Of two equal poles, over the corner of both together: 2π/√(√2 − 1).
-_POLE = 2 * np.pi / np.sqrt(np.sqrt(2) - 1)
 
 
 def _density(x: NDArray) -> NDArray[np.float64]:

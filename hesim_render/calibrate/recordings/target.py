@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from hesim_render.calibrate.estimate import estimated, not_identifiable
+from hesim_render.calibrate.estimate import Z_95, estimated, not_identifiable
 from hesim_render.calibrate.recordings.rests import overshoots, rests
 from hesim_render.calibrate.recordings.still import UNSURE_LEAK, jackknife
 from hesim_render.calibrate.recordings.tally import GROUPS, EventTally
 
 #: Simulated pixels, cycles before their counts begin, and most cycles that are simulated.
 _PIXELS, _WARM, _MOST_CYCLES = 8192, 4, 60
-#: Standard errors in half of an interval of 95 %.
-_TWO_SIDED_95 = 1.96
 #: Cycles, and ON and OFF events a cycle, that are needed.
 _LEAST_CYCLES, _LEAST_EVENTS = 3, 1.5
 
@@ -61,7 +59,6 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     cycles = tally.seconds / period_s if period_s is not None else 0.0
     count = count[:, seen]
     means = count.mean(axis=1)
-    ratio = max(means[0] - leak_hz * tally.seconds, 1.0) / means[1]
     count = count / max(cycles, 1e-300)
     if cycles < _LEAST_CYCLES or count.mean(axis=1).min() < _LEAST_EVENTS:
         return unknown(
@@ -69,6 +66,7 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
             f"events of a polarity in each; {_LEAST_CYCLES} cycles of {_LEAST_EVENTS} events are needed"
         )
     assert period_s is not None
+    ratio = max(means[0] - leak_hz * tally.seconds, 1.0) / means[1]
     course = _course(tally, leak_hz, period_s, ratio)
     unsure = course.unsure * np.array([1.0, 1 / ratio]) / count.mean(axis=1)
     rise = float(np.log(contrast))
@@ -107,12 +105,14 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
 
 def _widened(entry: dict[str, Any], over: NDArray[np.float64]) -> dict[str, Any]:
     """An estimate with an interval that also holds what is not known of the overshoots, relative, down and up."""
-    value, half = entry["value"], np.abs(np.array(entry["interval_95"]) - entry["value"])
-    below, above = np.hypot(half, over * value)
-    # so many standard errors as in the interval without it
-    errors = half.mean() / entry["standard_error"] if entry["standard_error"] > 0 else _TWO_SIDED_95
-    error = float((below + above) / (2 * errors))
-    return {**entry, "standard_error": error, "interval_95": [float(value - below), float(value + above)]}
+    if entry["value"] is None:
+        return entry
+    value, own = entry["value"], entry["standard_error"]
+    half = entry["interval_95"][1] - value
+    below, above = (float(end) for end in np.hypot(half, over * value))
+    # as many standard errors in half of the interval as without the overshoots
+    error = 0.5 * (below + above) / (half / own if own > 0 else Z_95)
+    return {**entry, "standard_error": error, "interval_95": [value - below, value + above]}
 
 
 class _Course(NamedTuple):

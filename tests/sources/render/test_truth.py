@@ -9,6 +9,7 @@ from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 import hesim_render as hr
+from hesim_render.core.backend import select
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sources.render.light_level import light_levels
 from hesim_render.sources.render.scene.trajectory import Trajectory
@@ -406,8 +407,9 @@ def test_a_scene_of_mitsubas_has_its_own_names():
     truth = SceneTruth(hr.load_scene("cornell-box"), rendering.mono(32, 32))
     assert {"small-box", "large-box", "floor"} <= set(truth.names.objects)
     ids = truth.ids(0)
-    # rays along the diagonals run exactly through the seams of its walls (on a GPU, 2.5 % of the rays miss them)
-    assert np.isfinite(truth.depth(0))[2:-2, 2:-2].mean() > 0.95 and len(np.unique(ids.object)) >= 6
+    # rays along the diagonals run exactly through the seams of its walls, which OptiX does not close
+    least = 0.97 if select().backend == "cuda" else 0.98
+    assert np.isfinite(truth.depth(0))[2:-2, 2:-2].mean() > least and len(np.unique(ids.object)) >= 6
     assert len(np.unique(ids.material)) >= 3
 
 
