@@ -121,7 +121,8 @@ def relative_illumination_at(
         return np.interp(np.sqrt(squared), kind.image_height_mm, kind.relative).astype(np.float32)
     if kind == "none":
         return np.ones(squared.shape, dtype=np.float32)
-    return ((1 + squared / lens.image_distance_mm**2) ** -2).astype(np.float32)
+    # not `** -2`, which takes ten times as long
+    return np.reciprocal(np.square(1 + squared / lens.image_distance_mm**2)).astype(np.float32)
 
 
 def response(spec: SensorSpec, filter_name: str, lens: Lens) -> Spectrum:

@@ -66,7 +66,7 @@ class Audit:
         seed: int,
     ) -> None:
         self._noted, self._source, self._quality, self._noise = noted, source, quality, noise
-        self._event_pixel = event_pixel
+        self._event_pixel, self._in_order = event_pixel, np.argsort(event_pixel)
         self._rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, 2]))
 
     def run(self) -> dict[str, Any]:
@@ -223,8 +223,7 @@ class Audit:
 
     def _place(self, pixel: NDArray[np.uint32]) -> NDArray[np.int64]:
         """Places of mosaic indices on the event grid."""
-        order = np.argsort(self._event_pixel)
-        return order[np.searchsorted(self._event_pixel, pixel, sorter=order)]
+        return self._in_order[np.searchsorted(self._event_pixel, pixel, sorter=self._in_order)]
 
     def _compare(self, units: Units, flux: NDArray[np.float64], reference: NDArray[np.float64]) -> Counted:
         """Compare the events of a flux with those of the reference; both are [window, unit], e⁻/s."""

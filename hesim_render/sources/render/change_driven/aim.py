@@ -148,20 +148,19 @@ class LaneAims:
     is_aimed: Mask
 
     @classmethod
-    def of(cls, aims: PairAims, pair: NDArray[np.integer], lane: UInt32, is_aimed: Mask) -> LaneAims:
+    def of(cls, aims: PairAims, pair: UInt32, is_aimed: Mask) -> LaneAims:
         """Spread the objects of pairs over lanes.
 
         Parameters
         ----------
         aims : of all pairs.
-        pair : pair of each packet of lanes.
-        lane : packet of each lane.
+        pair : of each lane.
         is_aimed : True for the rays that are aimed.
         """
         types = jit()
-        first, count = aims.first[pair], aims.count[pair]
+        first, count = (spread_out(types.UInt32, values, pair) for values in (aims.first, aims.count))
         group = table(types.UInt32, np.append(aims.group, np.zeros(2, np.uint32)))
-        return cls(spread_out(types.UInt32, first, lane), spread_out(types.UInt32, count, lane), group, is_aimed)
+        return cls(first, count, group, is_aimed)
 
 
 @dataclass(frozen=True)

@@ -234,18 +234,17 @@ class LaneEdges:
     is_strip: Mask
 
     @classmethod
-    def of(cls, edges: PairEdges, pair: NDArray[np.integer], lane: UInt32, is_strip: Mask) -> LaneEdges:
+    def of(cls, edges: PairEdges, pair: UInt32, is_strip: Mask) -> LaneEdges:
         """Spread the models of pairs over rays.
 
         Parameters
         ----------
         edges : of all pairs.
-        pair : pair of each packet of lanes.
-        lane : packet of each lane.
+        pair : of each lane.
         is_strip : True for the rays that start in the strip.
         """
         kind = jit().Float
-        spread = {each.name: spread_out(kind, getattr(edges, each.name)[pair], lane) for each in fields(edges)}
+        spread = {each.name: spread_out(kind, getattr(edges, each.name), pair) for each in fields(edges)}
         return cls(**spread, is_strip=is_strip)
 
     def place(

@@ -78,6 +78,15 @@ class _Traced:
     share: Float
 
 
+def pair_of_rays(packets: NDArray[np.int64]) -> UInt32:
+    """Pair of each ray, where pairs [n] have some packets of rays each, one pair after the other."""
+    import drjit as dr
+
+    types = jit()
+    packet = dr.arange(types.UInt32, int(packets.sum()) * PACKET) // PACKET
+    return spread_out(types.UInt32, np.repeat(np.arange(packets.size, dtype=np.uint32), packets), packet)
+
+
 class PacketTracer(Tracer):
     """Traces paths from mosaic pixels into a `MovingScene`.
 
@@ -148,7 +157,9 @@ class PacketTracer(Tracer):
 
     def axis_factor(self, pixel: NDArray[np.uint32]) -> NDArray[np.float32]:
         """Factor from the flux on the optical axis to that of each pixel."""
-        row, col = np.divmod(pixel.astype(np.int64), self.sensor.spec.geometry.cols)
+        cols = np.uint32(self.sensor.spec.geometry.cols)
+        row = pixel // cols
+        col = pixel - row * cols
         return optics.relative_illumination_at(self.sensor.spec, self.sensor.lens, row, col) * np.float32(
             self.radiance_scale
         )
@@ -191,15 +202,13 @@ class PacketTracer(Tracer):
 
         types = jit()
         used = int(packets.sum())
-        pair = np.repeat(np.arange(packets.size, dtype=np.uint32), packets)
-        starts = np.cumsum(packets) - packets
-        within = (np.arange(used) - np.repeat(starts, packets)).astype(np.uint32)
-
         ray_index = dr.arange(types.UInt32, used * PACKET)
-        packet = ray_index // PACKET
-        sample = spread_out(types.UInt32, within, packet) * PACKET + ray_index - packet * PACKET
-        tables = *lanes, half_rays.astype(np.uint32)
-        pixel, window, repeat, per_half = (spread_out(types.UInt32, values[pair], packet) for values in tables)
+        pair = pair_of_rays(packets)
+        # the first ray of the pair, and what the pair has
+        first = (np.cumsum(packets) - packets) * PACKET
+        tables = first.astype(np.uint32), *lanes, half_rays.astype(np.uint32)
+        start, pixel, window, repeat, per_half = (spread_out(types.UInt32, values, pair) for values in tables)
+        sample = ray_index - start
         half = dr.select(sample >= per_half, types.UInt32(1), types.UInt32(0))
         within_half, aimed = sample - half * per_half, None
         if aims is not None:
@@ -207,7 +216,7 @@ class PacketTracer(Tracer):
             per_half //= 2
             is_aimed = within_half >= per_half
             kind: type[LaneAims | LaneEdges] = LaneAims if isinstance(aims, PairAims) else LaneEdges
-            aimed = kind.of(aims, pair, packet, is_aimed)  # type: ignore[arg-type]
+            aimed = kind.of(aims, pair, is_aimed)  # type: ignore[arg-type]
             within_half = dr.select(is_aimed, within_half - per_half, within_half)
             half += dr.select(is_aimed, types.UInt32(2), 0)
         self._sampler.setup(key, pixel, half, within_half, per_half, MOST_SAMPLES // 2, repeat)

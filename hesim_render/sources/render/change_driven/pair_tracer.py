@@ -15,7 +15,7 @@ from hesim_render.core.rng import Stream
 from hesim_render.core.tables import spread_out, table
 from hesim_render.sources.render.change_driven.aim import PairAims, in_blocks
 from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges, joined_rays
-from hesim_render.sources.render.change_driven.packet_tracer import PACKET, PacketTracer
+from hesim_render.sources.render.change_driven.packet_tracer import PACKET, PacketTracer, pair_of_rays
 from hesim_render.sources.render.change_driven.pair_flux import (
     PairFlux,
     PilotFlux,
@@ -241,8 +241,7 @@ class PairTracer(PacketTracer):
             width = footprint if about is None else dr.opaque(jit().Float, 1.0)
             traced = self._packets_of(chosen, packets, packets * PACKET, moments, key, width, about, is_weighted=False)
             types = jit()
-            packet = dr.arange(types.UInt32, len(traced.fluxes[0])) // PACKET
-            by_control = spread_out(types.UInt32, np.repeat(controlled[some].astype(np.uint32), packets), packet)
+            by_control = spread_out(types.UInt32, controlled[some].astype(np.uint32), pair_of_rays(packets))
             values = [*traced.place, traced.share - 0.5, dr.select(by_control != 0, traced.fluxes[0], traced.fluxes[1])]
             dr.eval(values)
             return values
@@ -284,8 +283,7 @@ class PairTracer(PacketTracer):
         controlled_flux, plain_flux, _, met = self._packets_of(
             lanes, packets, rays // 2, moments, key, footprint, aims
         ).fluxes
-        packet = dr.arange(types.UInt32, len(met)) // PACKET
-        is_controlled = spread_out(types.UInt32, np.repeat(controlled.astype(np.uint32), packets), packet)
+        is_controlled = spread_out(types.UInt32, controlled.astype(np.uint32), pair_of_rays(packets))
         out.put(part, dr.select(is_controlled != 0, controlled_flux, plain_flux), met, packets, PACKET)
 
     def _pilot_block(

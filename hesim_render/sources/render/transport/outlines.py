@@ -184,15 +184,31 @@ class Screen:
             height = dr.dot(plane, point) - offset
             # from within its plane, an outline is a line and hides nothing
             counts = height > margin if one_sided else abs(height) > margin
-            rays = [corner - point for corner in corners]
-            total = outline_above_horizon(mi, rays, normal)
-            share += dr.select(counts, abs(total) * (0.5 / pi), 0.0)
-            # seen from above, corners run anticlockwise, so that a direction inside is on the right of all edges
-            above = height > 0
-            for ray, following in zip(rays, [*rays[1:], rays[0]], strict=True):
-                side = dr.dot(direction, dr.cross(ray, following))
-                counts &= dr.select(above, side < 0, side > 0)
-            count += dr.select(counts, 1.0, 0.0)
+            # what lies below the horizon as a whole hides nothing
+            rises = mi.Bool(False)
+            for corner in corners:
+                rises |= dr.dot(corner - point, normal) > 0
+
+            def hidden(
+                point: Point3, normal: Vector3, direction: Vector3, height: Float, corners: list[Point3] = corners
+            ) -> tuple[Float, Float]:
+                rays = [corner - point for corner in corners]
+                total = outline_above_horizon(mi, rays, normal)
+                # seen from above, corners run anticlockwise, so that a direction inside is on the right of all edges
+                above, inside = height > 0, mi.Bool(True)
+                for ray, following in zip(rays, [*rays[1:], rays[0]], strict=True):
+                    side = dr.dot(direction, dr.cross(ray, following))
+                    inside &= dr.select(above, side < 0, side > 0)
+                return abs(total) * (0.5 / pi), dr.select(inside, mi.Float(1.0), 0.0)
+
+            part, hides = dr.if_stmt(
+                (point, normal, direction, height),
+                counts & rises,
+                hidden,
+                lambda *_: (mi.Float(0.0), mi.Float(0.0)),
+                label="outline",
+            )
+            share, count = share + part, count + hides
         return share, count
 
 
