@@ -26,3 +26,32 @@ def test_samples_of_pixels_have_the_rays_of_all(scene, sensor, region, duration_
     assert max(part.size for part in samples) < 0.5 * pixels.size
     found = np.array([rays(part) for part in samples]) / rays(pixels)
     np.testing.assert_allclose(found, 1, atol=0.2)
+
+
+#: A plate flies past one corner of the picture; most of the wall never sees it.
+PLATE = """
+schema_version: 1
+name: plate
+description: A plate that flies past a corner of the picture.
+objects:
+  - {name: wall, shape: rectangle, size_m: [3, 3, 0], position_m: [0, 0, -0.3], reflectance: 0.43}
+  - {name: plate, shape: rectangle, size_m: [0.06, 0.04, 0], position_m: [-0.3, 0.22, 0], reflectance: 0.8}
+light: {type: point, illuminant: D50, position_m: [0.2, -0.3, 2.1], illuminance_lux: 700}
+camera: {origin_m: [0, 0, 1.3], target_m: [0, 0, 0]}
+motion:
+  - object: plate
+    keyframes:
+      - {t_us: 0, translation_m: [0, 0, 0]}
+      - {t_us: 20000, translation_m: [0.36, 0, 0]}
+"""
+
+
+def test_what_never_changes_is_counted_once(tmp_path):
+    """Pixels that nothing moving comes near were counted in each of the blocks of a run: twice the rays here."""
+    (tmp_path / "plate.yaml").write_text(PLATE)
+    estimates, sensor = [], hr.load_sensor("davis346").crop(60, 90, 100, 30)
+    recording = hr.simulate(
+        tmp_path / "plate.yaml", sensor, duration_s=0.003, audit=False, progress=False, on_estimate=estimates.append
+    )
+    render = recording.manifest["settings"]["render"]
+    np.testing.assert_allclose(estimates[0].rays, render["rays"] + render["pilot_rays"], rtol=0.2)

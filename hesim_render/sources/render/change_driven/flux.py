@@ -30,6 +30,7 @@ from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Counts, Flux
 from hesim_render.sources.render.change_driven.event_blocks import INTERVALS, BlockFlux, Blocks
 from hesim_render.sources.render.change_driven.forecast import forecast
+from hesim_render.sources.render.change_driven.neighbours import REACH
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
 from hesim_render.sources.render.change_driven.retrace import KnownPairs, traced_again
@@ -245,6 +246,23 @@ class ChangeDrivenFlux:
             rays[0] += int(each.sum(dtype=np.int64)) + self._tracer.rays_done - before
         renderer.counts, self._tracer.rays_done = counts, done
         return rays / pixel.size
+
+    def may_change(
+        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """Event pixels [n] near which a moving object may come at any time, as the pilot of a window says; the others are
+        rendered once.
+        """
+        renderer, windows = self._renderer, Windows(begin_us, end_us)
+        always_us, near_by = renderer.still("events").span_us, np.ones(pixel.size, np.bool_)
+        if self._is_dark or always_us is None:
+            return near_by
+        counts, done = replace(renderer.counts), self._tracer.rays_done
+        for band in renderer.bands(pixel, "events"):
+            _, near = renderer.pilot(band, windows, np.zeros((1, band.sites.size), np.int64), always_us)
+            near_by[band.place] = band.sites.most(near, REACH)
+        renderer.counts, self._tracer.rays_done = counts, done
+        return near_by
 
     def is_apart(self, role: Role) -> bool:
         """True if pixels of a role have no direct neighbours of that role."""

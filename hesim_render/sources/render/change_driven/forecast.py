@@ -50,22 +50,26 @@ def forecast(source: ChangeDrivenFlux, demand: Demand) -> Estimate:
         # the last block goes beyond the end of the run, which counts where all blocks are looked at
         is_all = len(chosen) == len(every)
         ends = [int(np.flatnonzero(b.wanted)[-1]) if is_all and b.wanted.any() else None for b in chosen]
+        begin_us, end_us = anchor_us(every[0].begin_us, every[0].end_us)
+        anchor = np.array([begin_us]), np.array([end_us])
+        # what never changes is rendered in the first anchor alone
+        alive = source.may_change(patch, *anchor)
+        moving, alive_part = patch[alive], float(np.mean(alive))
         counts = [
-            source.foretell(patch, block.begin_us, block.end_us, "events", end)
+            source.foretell(moving, block.begin_us, block.end_us, "events", end)
             for block, end in zip(chosen, ends, strict=True)
         ]
         each, compared, anchors, pilots = np.mean(counts, axis=0)
         # all pixels are rendered in the first anchor, and in later ones those that are compared with it
-        begin_us, end_us = anchor_us(every[0].begin_us, every[0].end_us)
-        first = source.foretell(patch, np.array([begin_us]), np.array([end_us]), "events", is_anchor=True)[[0, 3]].sum()
+        first = source.foretell(patch, *anchor, "events", is_anchor=True)[[0, 3]].sum()
         # the first window of the first block belongs to no block before it, and may be the anchor itself
         begin = 0.0
         if (begin_us, end_us) != (every[0].begin_us[0], every[0].end_us[0]):
-            begin = source.foretell(patch, every[0].begin_us[:1], every[0].end_us[:1], "events")[0]
+            begin = source.foretell(moving, every[0].begin_us[:1], every[0].end_us[:1], "events")[0]
         share = np.mean([np.ptp(block.end_us) / period_us(block.end_us) for block in chosen])
         more_anchors = max(0.0, float(np.ceil(demand.blocks.count * share)) - 1)
         rest = anchors * more_anchors + compared * (1 + more_anchors) + (each + pilots) * demand.blocks.count
-        rays += float(first + begin + rest) * event_pixel.size
+        rays += float(first + alive_part * (begin + rest)) * event_pixel.size
     # frames; of a static scene each pixel once, those of events included
     pixel = demand.pixels if is_static else np.unique(demand.frame_pixel if exposures else demand.frame_pixel[:0])
     if pixel.size:
