@@ -250,8 +250,8 @@ class ChangeDrivenFlux:
     def may_change(
         self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Event pixels [n] near which a moving object may come at any time, as the pilot of a window says; the others are
-        rendered once.
+        """Event pixels [n] near which a moving object may come at any time, as the pilot of a window says; all others
+        are rendered once.
         """
         renderer, windows = self._renderer, Windows(begin_us, end_us)
         always_us, near_by = renderer.still("events").span_us, np.ones(pixel.size, np.bool_)
