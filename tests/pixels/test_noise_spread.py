@@ -42,6 +42,8 @@ def test_bandwidths_have_the_law_that_is_stated():
     # Kolmogorov and Smirnov at 1e-3; deviates beyond 3 are cut off in the fastest rows and columns only
     assert stats.kstest(own.ravel(), "norm").pvalue > 1e-3
     assert factor.max() <= most_bandwidth(noise) == pytest.approx(1.31 * 1.12 * np.exp(0.69))
+    # the law of the first moment is taken at each pixel's part of the largest bandwidth
+    assert BandNoise(noise, 5).share(ROWS * COLS) == pytest.approx(factor.ravel() / most_bandwidth(noise), rel=1e-5)
     assert bandwidth_map(noise.without("mismatch")) is None and most_bandwidth(noise.without("mismatch")) == 1
 
 
