@@ -8,6 +8,7 @@ from scipy import stats
 
 from hesim_render.calibrate.estimate import estimated
 from hesim_render.calibrate.recordings import short_intervals, still, target
+from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import readout_limit
 from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, SLICES, EventTally, tally
 from hesim_render.exchange import EventStream
@@ -91,7 +92,7 @@ def test_rates_spread_and_regularity_have_the_errors_of_leaving_groups_out():
     def relative(a, b):
         return (np.mean(a * b) - a.mean() * b.mean()) / (a.mean() * b.mean())
 
-    told = still.rate_spread(one, 1)
+    told = rate_spread(one, 1)
     first, second = one.counts[1].astype(float)
     parts = [relative(first[group != k], second[group != k]) for k in range(GROUPS)]
     error = np.sqrt(19 / 20 * np.sum((np.array(parts) - np.mean(parts)) ** 2))
@@ -102,17 +103,17 @@ def test_rates_spread_and_regularity_have_the_errors_of_leaving_groups_out():
     one.variation, one.pairs = rng.uniform(3, 9, PIXELS), rng.integers(5, 9, PIXELS)
     total, count = one.variation.sum(), one.pairs.sum()
     parts = np.array([one.variation[group != k].sum() / one.pairs[group != k].sum() for k in range(GROUPS)])
-    told = still.regularity(one)
+    told = regularity(one)
     assert told["value"] == pytest.approx(total / count)
     assert told["standard_error"] == pytest.approx(np.sqrt(19 / 20 * np.sum((parts - parts.mean()) ** 2)))
     one.pairs = np.full(PIXELS, 5)
-    assert still.regularity(one)["value"] is not None
+    assert regularity(one)["value"] is not None
     one.used[7] = False  # a hot pixel takes no part in any of them
     first[7] = 1e6
-    assert still.rate_spread(one, 1)["value"] < 1 and still.group_rates(one)[1, 0] < 1e5
-    assert "195 pairs" in still.regularity(one)["reason"]
+    assert rate_spread(one, 1)["value"] < 1 and still.group_rates(one)[1, 0] < 1e5
+    assert "195 pairs" in regularity(one)["reason"]
     one.used[7], one.pairs[3] = True, 4
-    assert "199 pairs" in still.regularity(one)["reason"]
+    assert "199 pairs" in regularity(one)["reason"]
 
 
 @pytest.mark.parametrize("off", [1, 0])

@@ -10,6 +10,7 @@ import numpy as np
 
 from hesim_render.calibrate.estimate import not_identifiable
 from hesim_render.calibrate.recordings import still, target
+from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
 from hesim_render.calibrate.recordings.tally import EventTally, tally
 from hesim_render.calibrate.result import plain
@@ -139,8 +140,8 @@ def figures(
         entries.append({
             "file": Path(one.source).name, "lux": None if lux is None else lux[k], "seconds": one.seconds,
             "events": int(one.counts.sum()), "on_rate_hz": still.rate(rates, 0), "off_rate_hz": still.rate(rates, 1),
-            "on_rate_spread_rel": still.rate_spread(one, 0), "off_rate_spread_rel": still.rate_spread(one, 1),
-            "on_local_variation": still.regularity(one), "leak_rate_hz": leak,
+            "on_rate_spread_rel": rate_spread(one, 0), "off_rate_spread_rel": rate_spread(one, 1),
+            "on_local_variation": regularity(one), "leak_rate_hz": leak,
         })  # fmt: skip
         if problem := still.not_still(one):
             findings.append({"file": Path(one.source).name, "text": problem})

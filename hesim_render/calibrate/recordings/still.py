@@ -37,8 +37,6 @@ _RATIO_SHIFT, _LEAK_SHIFT = 1.0, 3.0
 UNSURE_LEAK = 0.1
 #: Range in which the ratio of the thresholds is taken to be where nothing tells it.
 _RATIO = (0.5, 2.0)
-#: Pairs of ON intervals that the local variation needs.
-_LEAST_PAIRS = 200
 
 
 def group_rates(tally: EventTally) -> NDArray[np.float64]:
@@ -60,43 +58,6 @@ def rate(rates: NDArray[np.float64], polarity: int) -> dict[str, Any]:
     if rates[polarity, 0] == 0:
         return {"value": 0.0, "unit": "Hz", "note": "no event"}
     return estimated(rates[polarity, 0], float(jackknife(rates[polarity])), "Hz", GROUPS)
-
-
-def rate_spread(tally: EventTally, polarity: int) -> dict[str, Any]:
-    """Standard deviation of the rates over pixels, relative: the covariance of both halves of the time, in which the
-    counting of events has no part. The error is that of a jackknife over groups of pixels.
-    """
-    halves = tally.counts[polarity].astype(np.float64)
-    if halves[:, tally.used].sum() < 2 * _EVENTS_TO_BE_SILENT:
-        return not_identifiable(f"{int(halves[:, tally.used].sum())} events in all")
-    # sums of each group of pixels: number, counts of both halves, and their product, [4, group]
-    sums = np.array([tally.by_group(v) for v in (np.ones(tally.pixels), *halves, halves[0] * halves[1])])
-
-    def relative(s: NDArray[np.float64]) -> NDArray[np.float64]:
-        means = s[1:] / s[0]
-        return (means[2] - means[0] * means[1]) / np.maximum(means[0] * means[1], 1e-300)
-
-    whole = float(relative(sums.sum(axis=1)))
-    # the same without each group, for the jackknife
-    parts = relative(sums.sum(axis=1)[:, None] - sums)
-    error = float(jackknife(np.append(whole, parts)))
-    if whole <= 2 * error:
-        limit = float(np.sqrt(max(whole + 2 * error, 0.0)))
-        return {"value": 0.0, "upper_limit": limit, "note": "the pixels scatter no more than counting makes them"}
-    return estimated(np.sqrt(whole), error / (2 * np.sqrt(whole)), "relative std", GROUPS)
-
-
-def regularity(tally: EventTally) -> dict[str, Any]:
-    """Local variation of a pixel's ON intervals [shinomoto2003]: 1 for a Poisson process, 0 for equal intervals."""
-    of_groups, variation = tally.by_group(tally.pairs), tally.by_group(tally.variation)
-    pairs = int(of_groups.sum())
-    if pairs < _LEAST_PAIRS:
-        return not_identifiable(f"{pairs} pairs of successive ON intervals; {_LEAST_PAIRS} are needed")
-    # mean over pairs of intervals, then the same without each group
-    whole = variation.sum() / pairs
-    parts = (variation.sum() - variation) / np.maximum(pairs - of_groups, 1)
-    error = float(jackknife(np.append(whole, parts)))
-    return estimated(whole, error, "", GROUPS)
 
 
 class LeakBalance(NamedTuple):
