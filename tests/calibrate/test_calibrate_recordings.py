@@ -329,6 +329,29 @@ def test_a_scene_that_is_not_still_is_a_finding(tmp_path):
     assert "the scene moves" in found["findings"][0]["text"]
 
 
+def test_a_camera_that_has_not_settled_spoils_no_leak():
+    """A burst of OFF events at the begin of one of three recordings: the others tell what they told without it."""
+    truth, events, moving = sensor(4)
+    rng = np.random.default_rng(15)
+    burst = np.zeros(6 * PIXELS, EVENT_DTYPE)
+    burst["t_us"], burst["polarity"] = np.sort(rng.integers(1, 200_000, burst.size)), -1
+    burst["x"], burst["y"] = rng.integers(0, SHAPE[1], burst.size), rng.integers(0, SHAPE[0], burst.size)
+    spoiled = np.concatenate([events[1], burst])
+    spoiled = spoiled[np.argsort(spoiled["t_us"], kind="stable")]
+    given = [tally(EventStream.of(one, SHAPE)) for one in (events[0], spoiled, events[2], moving)]
+    three = calibration.figures(given[:3], None, LUX, None, None)
+    assert "the camera was not settled" in three["findings"][0]["text"] and len(three["findings"]) == 1
+    assert "three different lights" in three["threshold_ratio"]["reason"]
+    assert "its rate changes" in three["recordings"][1]["leak_rate_hz"]["reason"]
+    two = calibration.figures([given[0], given[2]], None, (LUX[0], LUX[2]), None, None)
+    assert three["recordings"][2]["leak_rate_hz"] == two["recordings"][1]["leak_rate_hz"]
+    alone = calibration.figures(given[1:2], given[3], LUX[1:2], np.exp(RISE), None)
+    assert "of every recording changes" in alone["leak_dark_hz"]["reason"]
+    # a target tells thresholds and their ratio without any
+    assert abs(alone["theta_on"]["value"] - truth["theta_on"]) < 0.05 * truth["theta_on"]
+    assert alone["threshold_ratio"]["value"] is not None
+
+
 def test_few_events_of_a_still_scene_are_no_finding():
     """Random events, a few in all: their rate scatters by counting alone. 40 recordings, chance of one finding 0.04."""
     rng = np.random.default_rng(11)

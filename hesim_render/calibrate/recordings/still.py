@@ -89,6 +89,9 @@ def balance(tallies: Sequence[EventTally], lux: Sequence[float] | None) -> LeakB
     tallies : recordings of still scenes.
     lux : illuminance of each, or None.
     """
+    if not tallies:
+        reason = not_identifiable("the rate of every recording changes (findings)")
+        return LeakBalance(reason, [], reason, reason)
     rates = np.array([group_rates(one) for one in tallies])  # [recording, polarity, k]
     if lux is None:
         reason = not_identifiable("it takes the illuminances (--lux), or a moving target (--target)")
@@ -128,6 +131,8 @@ def balance_with_target(
     ratio : θ₋/θ₊, mean over pixels, as an entry of the result.
     leak_hz : leak of a pixel while the target moved, Hz.
     """
+    if not tallies:
+        return balance(tallies, lux)._replace(ratio=ratio)
     on, off = moving.per_pixel().astype(np.float64)
     # pixels that the target passed over
     seen = (off > 0.25 * np.median(off[off > 0])) & moving.used
@@ -250,8 +255,8 @@ def silent_share(tallies: Sequence[EventTally]) -> dict[str, Any]:
     return share(int(np.count_nonzero(total == 0)), total.size)
 
 
-def not_still(tally: EventTally) -> str | None:
-    """A line that says that a recording is not one of a still scene; None where its rate is steady enough.
+def unsteady(tally: EventTally) -> str | None:
+    """A line that says that the rate of a recording changes; None where it is steady enough.
 
     The last quarter of the slices against the first, and the largest against the mean, each beyond what counting does.
     """
@@ -269,7 +274,12 @@ def not_still(tally: EventTally) -> str | None:
             f"its rate goes from {early:.4g} to {late:.4g} Hz a pixel, at most {each.max():.4g}: the scene moves, the "
             "lamp flickers, or the camera was not settled"
         )
-    return of_a_lamp(tally)
+    return None
+
+
+def not_still(tally: EventTally) -> str | None:
+    """A line that says that a recording is not one of a still scene in steady light; None where it may be."""
+    return unsteady(tally) or of_a_lamp(tally)
 
 
 def of_a_lamp(tally: EventTally) -> str | None:
