@@ -342,18 +342,26 @@ def test_a_mosaic_that_is_not_stated_is_recognised(tmp_path):
         assert holds(found["quantum_efficiency"], 0.52 * camera.efficiency) and holds(found["K"], camera.gain)
 
 
-def test_gaps_between_colours_are_not_those_of_scaled_frames(tmp_path):
-    """A quiet sensor behind green light: no pixel has the grey values between those of red, blue and green."""
-    share = np.tile([[0.17, 1.0], [0.96, 0.31]], (52, 67))
+GREEN, GREY = [[0.17, 1.0], [0.96, 0.31]], [[1.0, 1.0], [1.0, 1.0]]
+PLACES = r"452 photons, 400 µs: the places of a 2x2 tile have \d\d, 100, 9\d, \d\d % of the largest"
+
+
+@pytest.mark.parametrize(
+    ("tile", "bits", "message"),
+    [(GREEN, 12, PLACES), (GREY, 16, "RAW frames; if they are 12 bits of an ADC, moved to the left, state 12 bits")],
+    ids=("colours", "bits"),
+)
+def test_gaps_between_grey_values_are_not_always_those_of_scaled_frames(tmp_path, tile, bits, message):
+    """A quiet sensor: no pixel has the values between those of its colours, or 12 bit stand at the upper end of 16."""
+    share = np.tile(tile, (52, 67))
     rng, listed = np.random.default_rng(8), []
     for us, count in (*((400.0 + 300 * k, 2) for k in range(5)), (900.5, 3)):
         for lit in (True, False):
             electrons = rng.poisson(lit * CAMERA.efficiency * CAMERA.photons(us) * share, (count, *share.shape))
             value = CAMERA.black + CAMERA.gain * (electrons + 2.1 * rng.standard_normal(electrons.shape))
-            listed.append((lit, us, CAMERA.photons(us), np.rint(value).astype(np.uint16)))
-    folder = Maker().write(tmp_path / "set", listed, 12, share.shape)
-    places = r"Data.txt:\d+: 452 photons, 400 µs: the places of a 2x2 tile have \d\d, 100, 9\d, \d\d % of the largest"
-    with pytest.raises(SpecError, match=places):
+            listed.append((lit, us, CAMERA.photons(us), np.rint(value).astype(np.uint16) << (bits - 12)))
+    folder = Maker().write(tmp_path / "set", listed, bits, share.shape)
+    with pytest.raises(SpecError, match=message):
         both_levels(read_pair_set(folder))
 
 
