@@ -166,7 +166,7 @@ def _check(entry: Series, statistics: tuple[float, ...], first: NDArray, second:
     absent, expected = _gaps(first, second, full)
     if expected >= 4 and absent > _GAPS * expected:
         require_one_colour(entry, first)  # between the values of colours are such that no pixel has
-        every = int(np.bitwise_or.reduce(first | second, axis=None))
+        every = int(np.bitwise_or.reduce(first, axis=None))
         step = every & -every  # largest power of two that divides all values
         bits = full.bit_length() - step.bit_length() + 1
         advice = f"; if they are {bits} bits of an ADC, moved to the left, state {bits} bits" if step > 1 else ""
