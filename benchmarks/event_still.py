@@ -22,7 +22,7 @@ from hesim_render.sensor.reading import read_sensor
 #: θ₊ over the noise's σ at 0.1 lx, bandwidth of the noise (Hz), its spread over pixels, θ₋ over θ₊; leak in the dark
 #: (Hz), its growth (Hz/lx), its tail (Hz). `rows` is one figure for two: by so much odd rows have a larger bandwidth
 #: and even ones a smaller one, and so much the leak differs from pixel to pixel. Each alone would be 0.30 and 0.29.
-FITTED = {"threshold": 2.1, "bandwidth_hz": 26.3, "bandwidth_rel": 0.46, "off": 1.32, "rows": 0.3,
+FITTED = {"threshold": 2.1, "bandwidth_hz": 24.7, "bandwidth_rel": 0.44, "off": 1.32, "rows": 0.3,
           "leak_hz": 0.0451, "leak_hz_per_lux": 2.7e-5, "tail_hz": 0.01466}  # fmt: skip
 #: Light, lx, name in the file and length of the recording, s: not stated, read from the tables (the longest sums of the
 #: intervals of a pixel; the fast pixels' counts at 161 and 3000 lx, whose rates are the same, have the ratio 1.2).

@@ -180,7 +180,8 @@ def read_pair_set(folder: str | Path) -> PairSet:
             file=path / "capture.yaml",
         )
     shape = shape[0] // tile[0], shape[1] // tile[1]
-    own = spec.model_copy(update={"tile_rows": 1, "tile_cols": 1, "roi": None if tile != (1, 1) else spec.roi})
+    of_place: dict[str, object] = {} if tile == (1, 1) else {"tile_position": None, "roi": None}
+    own = spec.model_copy(update={"tile_rows": 1, "tile_cols": 1, **of_place})
     return replace(_arranged(where, own, shape, series), tile=tile, position=position or (0, 0))
 
 

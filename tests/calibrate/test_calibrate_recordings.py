@@ -9,13 +9,14 @@ import pytest
 from scipy import stats
 
 from hesim_render.calibrate.recordings import calibrate_recordings, calibration, still
+from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
 from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, tally
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.exchange import EventStream
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from tests.support.event_files import written
-from tests.support.still_pixels import random_events, still_events, target_events
+from tests.support.still_pixels import even_events, random_events, still_events, target_events
 
 SHAPE = (22, 27)
 PIXELS = SHAPE[0] * SHAPE[1]
@@ -123,11 +124,37 @@ def test_spread_of_the_rates_has_no_part_of_the_counting():
     """Random events with rates of 30 % spread, and with none."""
     rng = np.random.default_rng(3)
     rates = 20.0 * np.maximum(1 + 0.3 * rng.standard_normal(PIXELS), 0.1)
-    found = still.rate_spread(tally(EventStream.of(random_events(rng, rates, 0.0, seconds=2.0, shape=SHAPE), SHAPE)), 0)
+    found = rate_spread(tally(EventStream.of(random_events(rng, rates, 0.0, seconds=2.0, shape=SHAPE), SHAPE)), 0)
     assert abs(found["value"] - 0.3) < 4 * found["standard_error"] < 0.1
     even = random_events(rng, np.full(PIXELS, 20.0), 0.0, seconds=2.0, shape=SHAPE)
-    assert still.rate_spread(tally(EventStream.of(even, SHAPE)), 0)["value"] == 0
-    assert still.regularity(tally(EventStream.of(even, SHAPE)))["value"] == pytest.approx(1.0, abs=0.05)
+    assert rate_spread(tally(EventStream.of(even, SHAPE)), 0)["value"] == 0
+    assert regularity(tally(EventStream.of(even, SHAPE)))["value"] == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("gamma", "events"), [(40.0, 2.2), (6.0, 3.1), (2.0, 2.4), (1.0, 5.3)])
+def test_even_intervals_do_not_hide_the_spread_of_the_rates(gamma, events):
+    """So many ON events a pixel and half of the time; without the law of even intervals it is up to 15 % too low."""
+    rng, away = np.random.default_rng(21), []
+    for _ in range(3):
+        rates = events / 1.5 * np.maximum(1 + 0.25 * rng.standard_normal(4000), 0.1)
+        seen = even_events(rng, rates, gamma, seconds=3.0, shape=(50, 80))
+        of = rate_spread(tally(EventStream.of(seen, (50, 80))), 0)
+        true = rates.std() / rates.mean()
+        assert abs(of["value"] - true) < 3 * of["standard_error"] < 0.2 * true
+        away.append(of["value"] / true - 1)
+    assert abs(np.mean(away)) < (0.03 if gamma > 1 else 0.06)
+
+
+def test_counts_of_like_places_between_whole_numbers_tell_little_of_a_small_spread():
+    """2.5 even events of each pixel in half of the time; 1.8 are too few, and so are 180 pairs of intervals."""
+    rng, shape = np.random.default_rng(22), (50, 80)
+    rates = 2.5 / 1.5 * (1 + 0.08 * rng.standard_normal(4000))
+    of = rate_spread(tally(EventStream.of(even_events(rng, rates, 60.0, seconds=3.0, shape=shape), shape)), 0)
+    assert of["value"] == 0 and 0.15 < of["upper_limit"] < 0.3
+    slow = tally(EventStream.of(even_events(rng, 0.72 * rates, 60.0, seconds=3.0, shape=shape), shape))
+    assert "a pixel has 1.8 events in half of the time; 2 are needed" in rate_spread(slow, 0)["reason"]
+    few = tally(EventStream.of(even_events(rng, 2 * rates[:20], 60.0, seconds=3.0, shape=(4, 5)), (4, 5)))
+    assert "pairs of successive ON intervals; 200 are needed" in rate_spread(few, 0)["reason"]
 
 
 @pytest.mark.parametrize("dead_us", (23.4, 61.7, 812.5))
@@ -300,6 +327,29 @@ def test_a_scene_that_is_not_still_is_a_finding(tmp_path):
     kept = events[(events["t_us"] > 600_000) | (rng.random(events.size) < 0.3)]
     found = calibrate_recordings([written(kept, "evt3", tmp_path, SHAPE)])
     assert "the scene moves" in found["findings"][0]["text"]
+
+
+def test_a_camera_that_has_not_settled_spoils_no_leak():
+    """A burst of OFF events at the begin of one of three recordings: the others tell what they told without it."""
+    truth, events, moving = sensor(4)
+    rng = np.random.default_rng(15)
+    burst = np.zeros(6 * PIXELS, EVENT_DTYPE)
+    burst["t_us"], burst["polarity"] = np.sort(rng.integers(1, 200_000, burst.size)), -1
+    burst["x"], burst["y"] = rng.integers(0, SHAPE[1], burst.size), rng.integers(0, SHAPE[0], burst.size)
+    spoiled = np.concatenate([events[1], burst])
+    spoiled = spoiled[np.argsort(spoiled["t_us"], kind="stable")]
+    given = [tally(EventStream.of(one, SHAPE)) for one in (events[0], spoiled, events[2], moving)]
+    three = calibration.figures(given[:3], None, LUX, None, None)
+    assert "the camera was not settled" in three["findings"][0]["text"] and len(three["findings"]) == 1
+    assert "three different lights" in three["threshold_ratio"]["reason"]
+    assert "its rate changes" in three["recordings"][1]["leak_rate_hz"]["reason"]
+    two = calibration.figures([given[0], given[2]], None, (LUX[0], LUX[2]), None, None)
+    assert three["recordings"][2]["leak_rate_hz"] == two["recordings"][1]["leak_rate_hz"]
+    alone = calibration.figures(given[1:2], given[3], LUX[1:2], np.exp(RISE), None)
+    assert "of every recording changes" in alone["leak_dark_hz"]["reason"]
+    # a target tells thresholds and their ratio without any
+    assert abs(alone["theta_on"]["value"] - truth["theta_on"]) < 0.05 * truth["theta_on"]
+    assert alone["threshold_ratio"]["value"] is not None
 
 
 def test_few_events_of_a_still_scene_are_no_finding():

@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 from emva_makers import MAKERS, NARROW, Maker
 
+from hesim_render.calibrate.aps.calibration import calibrate_aps
+from hesim_render.calibrate.aps.pair_levels import both_levels
 from hesim_render.calibrate.aps.pairs import evaluate
 from hesim_render.calibrate.aps.pairs_output import content
+from hesim_render.calibration.file import read_calibration
 from hesim_render.core.errors import SpecError
 from hesim_render.recording.pair_set import is_pair_set, read_pair_set
 from hesim_render.report.emva import frame_figures
@@ -304,6 +307,10 @@ def test_a_mosaic_is_refused_or_evaluated_at_one_place(taken, expected, tmp_path
     (folder / "capture.yaml").write_text(text + "tile_position: [1, 0]\n", encoding="utf-8")
     found = figures(folder)
     assert found["K"] == expected["wide"][1]["K"] and found["prnu_percent"] == expected["wide"][1]["prnu_percent"]
+    # the file is of the pixels of this place, without a tile
+    calibrate_aps(folder, tmp_path / "found.yaml")
+    capture = read_calibration(tmp_path / "found.yaml")["capture"]
+    assert (capture["tile_rows"], capture["tile_cols"]) == (1, 1) and "tile_position" not in capture
     (folder / "capture.yaml").write_text(text + "tile_position: [2, 0]\n", encoding="utf-8")
     with pytest.raises(SpecError, match=r"tile_position \[2, 0\] lies outside of the tile"):
         read_pair_set(folder)
@@ -333,6 +340,29 @@ def test_a_mosaic_that_is_not_stated_is_recognised(tmp_path):
         (folder / "capture.yaml").write_text("bit_depth: 12\ntile_rows: 2\ntile_cols: 2\ntile_position: [1, 1]\n")
         found = figures(folder)
         assert holds(found["quantum_efficiency"], 0.52 * camera.efficiency) and holds(found["K"], camera.gain)
+
+
+GREEN, GREY = [[0.17, 1.0], [0.96, 0.31]], [[1.0, 1.0], [1.0, 1.0]]
+PLACES = r"452 photons, 400 µs: the places of a 2x2 tile have \d\d, 100, 9\d, \d\d % of the largest"
+
+
+@pytest.mark.parametrize(
+    ("tile", "bits", "message"),
+    [(GREEN, 12, PLACES), (GREY, 16, "RAW frames; if they are 12 bits of an ADC, moved to the left, state 12 bits")],
+    ids=("colours", "bits"),
+)
+def test_gaps_between_grey_values_are_not_always_those_of_scaled_frames(tmp_path, tile, bits, message):
+    """A quiet sensor: no pixel has the values between those of its colours, or 12 bit stand at the upper end of 16."""
+    share = np.tile(tile, (52, 67))
+    rng, listed = np.random.default_rng(8), []
+    for us, count in (*((400.0 + 300 * k, 2) for k in range(5)), (900.5, 3)):
+        for lit in (True, False):
+            electrons = rng.poisson(lit * CAMERA.efficiency * CAMERA.photons(us) * share, (count, *share.shape))
+            value = CAMERA.black + CAMERA.gain * (electrons + 2.1 * rng.standard_normal(electrons.shape))
+            listed.append((lit, us, CAMERA.photons(us), np.rint(value).astype(np.uint16) << (bits - 12)))
+    folder = Maker().write(tmp_path / "set", listed, bits, share.shape)
+    with pytest.raises(SpecError, match=message):
+        both_levels(read_pair_set(folder))
 
 
 def edited(expected, tmp_path, change):

@@ -8,6 +8,7 @@ from scipy import stats
 
 from hesim_render.calibrate.estimate import estimated
 from hesim_render.calibrate.recordings import short_intervals, still, target
+from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import readout_limit
 from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, SLICES, EventTally, tally
 from hesim_render.exchange import EventStream
@@ -91,7 +92,7 @@ def test_rates_spread_and_regularity_have_the_errors_of_leaving_groups_out():
     def relative(a, b):
         return (np.mean(a * b) - a.mean() * b.mean()) / (a.mean() * b.mean())
 
-    told = still.rate_spread(one, 1)
+    told = rate_spread(one, 1)
     first, second = one.counts[1].astype(float)
     parts = [relative(first[group != k], second[group != k]) for k in range(GROUPS)]
     error = np.sqrt(19 / 20 * np.sum((np.array(parts) - np.mean(parts)) ** 2))
@@ -99,20 +100,41 @@ def test_rates_spread_and_regularity_have_the_errors_of_leaving_groups_out():
     assert whole > 2 * error
     assert told["value"] == pytest.approx(np.sqrt(whole))
     assert told["standard_error"] == pytest.approx(error / (2 * np.sqrt(whole)))
+    # even intervals: a gamma law of shape r has a local variation of 3/(2r + 1), and the squared deviation 1/r
+    one.pairs, one.variation = np.full(PIXELS, 6), np.full(PIXELS, 6 * 3 / (2 * 2.5 + 1))
+    for counts in (rng.poisson(rng.uniform(20, 80, PIXELS), (2, PIXELS)), np.where(np.arange(PIXELS) % 4, 4, 3)):
+        one.counts[0] = counts
+        a, b = one.counts[0].astype(float)
+        own = [relative(a[group != k], b[group != k]) for k in range(GROUPS)]
+        scatter = np.sqrt(19 / 20 * np.sum((np.array(own) - np.mean(own)) ** 2))
+        even = (1 - 1 / 2.5**2) / 12 / (a.mean() * b.mean())
+        square = relative(a, b) + even
+        like = 2 * np.exp(-2 * np.pi**2 * square * a.mean() * b.mean())
+        told = rate_spread(one, 0)
+        assert told["value"] == pytest.approx(np.sqrt(square))
+        error = np.hypot(scatter, (0.1 + like) * even)
+        assert told["standard_error"] == pytest.approx(error / (2 * np.sqrt(square)), rel=1e-6)
+    assert like > 0.005
     one.variation, one.pairs = rng.uniform(3, 9, PIXELS), rng.integers(5, 9, PIXELS)
     total, count = one.variation.sum(), one.pairs.sum()
     parts = np.array([one.variation[group != k].sum() / one.pairs[group != k].sum() for k in range(GROUPS)])
-    told = still.regularity(one)
+    told = regularity(one)
     assert told["value"] == pytest.approx(total / count)
     assert told["standard_error"] == pytest.approx(np.sqrt(19 / 20 * np.sum((parts - parts.mean()) ** 2)))
     one.pairs = np.full(PIXELS, 5)
-    assert still.regularity(one)["value"] is not None
+    assert regularity(one)["value"] is not None
     one.used[7] = False  # a hot pixel takes no part in any of them
     first[7] = 1e6
-    assert still.rate_spread(one, 1)["value"] < 1 and still.group_rates(one)[1, 0] < 1e5
-    assert "195 pairs" in still.regularity(one)["reason"]
+    assert rate_spread(one, 1)["value"] < 1 and still.group_rates(one)[1, 0] < 1e5
+    assert "195 pairs" in regularity(one)["reason"]
+    one.counts[1] = 0
+    one.counts[1, 0], one.counts[1, :, 7] = 1, 1000  # those of the hot pixel do not count
+    one.counts[1, 1, 3] += 59 - one.counts[1][:, one.used].sum()
+    assert rate_spread(one, 1)["reason"] == "59 events in all"
+    one.counts[1, 1, 3] += 1
+    assert "reason" not in rate_spread(one, 1)
     one.used[7], one.pairs[3] = True, 4
-    assert "199 pairs" in still.regularity(one)["reason"]
+    assert "199 pairs" in regularity(one)["reason"]
 
 
 @pytest.mark.parametrize("off", [1, 0])

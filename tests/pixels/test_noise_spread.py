@@ -42,6 +42,8 @@ def test_bandwidths_have_the_law_that_is_stated():
     # Kolmogorov and Smirnov at 1e-3; deviates beyond 3 are cut off in the fastest rows and columns only
     assert stats.kstest(own.ravel(), "norm").pvalue > 1e-3
     assert factor.max() <= most_bandwidth(noise) == pytest.approx(1.31 * 1.12 * np.exp(0.69))
+    # the law of the first moment is taken at each pixel's part of the largest bandwidth
+    assert BandNoise(noise, 5).share(ROWS * COLS) == pytest.approx(factor.ravel() / most_bandwidth(noise), rel=1e-5)
     assert bandwidth_map(noise.without("mismatch")) is None and most_bandwidth(noise.without("mismatch")) == 1
 
 
@@ -52,18 +54,26 @@ def test_a_crop_has_the_bandwidths_of_the_full_sensor():
     assert np.array_equal(bandwidth_map(part).reshape(9, 13), whole[5:14, 7:20])
 
 
-def test_rows_of_a_tile_are_counted_by_its_event_pixels():
-    """One event pixel in 4×4: rows 0, 1, 2 … of events are those of tiles."""
-    sensor = load_sensor("gen2", {"evs.noise_spread": None})
-    layout = Layout.full(sensor.spec).crop(64, 48)
-    spec = spec_of().evs.model_copy(update={"noise_spread": spec_of().evs.noise_spread.model_copy(
-        update={"bandwidth_rel": 0.0})})  # fmt: skip
-    factor = bandwidth_map(EvsNoise(spec, layout, 3, np.ones(1))).reshape(layout.evs_shape)
+@pytest.mark.parametrize("grid", [(1, 1), (3, 1), (1, 2)])
+def test_rows_of_a_tile_are_counted_by_its_event_pixels(grid):
+    """One event pixel in 4×4: rows of events are those of tiles. Three rows, or two columns, in 5×4: they alternate."""
+    tile = {(1, 1): None, (3, 1): "R w G G\nR R G G\nR w G B\nG G B B\nG w B B\n",
+            (1, 2): "R R G G\nR R G G\nw R w B\nG G B B\nG G B B\n"}[grid]  # fmt: skip
+    changes = {} if tile is None else {
+        "tile": tile, "evs_grid": {"rows_per_tile": grid[0], "cols_per_tile": grid[1]},
+    }  # fmt: skip
+    layout = Layout.full(load_sensor("gen2", {"geometry.rows": 40, "geometry.cols": 64, **changes}).spec)
+    parts = {"bandwidth_rel": 0.0, "odd_rows_rel": -0.31, "odd_cols_rel": 0.12}
+    spec = spec_of().evs.model_copy(update={"noise_spread": spec_of().evs.noise_spread.model_copy(update=parts)})
+    noise = EvsNoise(spec, layout, 3, np.ones(1))
+    factor = bandwidth_map(noise).reshape(layout.evs_shape)
+    assert factor.shape == ((10, 16) if tile is None else (8 * grid[0], 16 * grid[1]))
     row, col = (
-        np.where(np.arange(factor.shape[0]) % 2, 1.31, 0.69),
-        np.where(np.arange(factor.shape[1]) % 2, 0.88, 1.12),
+        np.where(np.arange(factor.shape[0]) % 2, 0.69, 1.31),
+        np.where(np.arange(factor.shape[1]) % 2, 1.12, 0.88),
     )
     assert factor == pytest.approx(row[:, None] * col, rel=1e-6)
+    assert most_bandwidth(noise) == pytest.approx(1.31 * 1.12)
 
 
 def test_noise_of_each_pixel_has_its_bandwidth():

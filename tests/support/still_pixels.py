@@ -119,3 +119,12 @@ def random_events(rng, rate_hz, dead_us, *, seconds, shape):
         found.append((np.ceil(t_us).astype(int), pixel, rng.choice([-1, 1], pixel.size)))
         t_us = t_us + dead_us + rng.exponential(1e6 / rate_hz[pixel])
     return _events(found, shape[1])
+
+
+def even_events(rng, rate_hz, gamma, *, seconds, shape):
+    """ON events of pixels [pixel] with intervals of a gamma law of that shape: even ones, or random ones with 1."""
+    count = round(1.6 * rate_hz.max() * seconds) + 60
+    t = np.cumsum(rng.gamma(gamma, 1 / gamma, (count, rate_hz.size)), axis=0) / rate_hz - 20 / rate_hz
+    kept = (t > 0) & (t < seconds)
+    pixel = np.broadcast_to(np.arange(rate_hz.size), t.shape)[kept]
+    return _events([(np.ceil(t[kept] * 1e6).astype(int), pixel, np.ones(pixel.size, int))], shape[1])

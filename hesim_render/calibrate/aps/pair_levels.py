@@ -24,6 +24,8 @@ CLIPPED_SHARE = 1e-4
 WELL_SHARE = 0.01
 #: Change of the light between frames of one series that is refused.
 MOST_CHANGE = 0.02
+#: Relative differences of the places of a tile from which they are colours.
+_MOSAIC = 0.08
 _SIGMAS = 6.0
 
 
@@ -163,9 +165,29 @@ def _check(entry: Series, statistics: tuple[float, ...], first: NDArray, second:
         )
     absent, expected = _gaps(first, second, full)
     if expected >= 4 and absent > _GAPS * expected:
+        require_one_colour(entry, first)  # between the values of colours are such that no pixel has
+        every = int(np.bitwise_or.reduce(first, axis=None))
+        step = every & -every  # largest power of two that divides all values
+        bits = full.bit_length() - step.bit_length() + 1
+        advice = f"; if they are {bits} bits of an ADC, moved to the left, state {bits} bits" if step > 1 else ""
         raise entry.error(
             f"{absent} of {expected} grey values around the mean never occur: the frames were scaled, or stretched to "
-            "more bits, after the ADC; capture RAW frames"
+            f"more bits, after the ADC; capture RAW frames{advice}"
+        )
+
+
+def require_one_colour(entry: Series, signal: NDArray) -> None:
+    """Refuse frames whose places of a 2x2 tile have signals of their own, far apart beside the pixels' spread."""
+    rows, cols = (count - count % 2 for count in signal.shape)
+    # the four places of a tile, [place, pixel]
+    places = signal[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2).transpose(1, 3, 0, 2).reshape(4, -1)
+    middle = np.median(places, axis=1)
+    spread = np.median(np.abs(places - middle[:, None])) / 0.6745
+    if np.ptp(middle) > max(_MOSAIC * middle.mean(), 3 * spread):
+        shares = ", ".join(f"{100 * value / middle.max():.0f}" for value in middle)
+        raise entry.error(
+            f"the places of a 2x2 tile have {shares} % of the largest signal: a colour mosaic. EMVA 1288 evaluates one "
+            "colour at a time; state tile_rows: 2, tile_cols: 2 and tile_position: [row, column] in capture.yaml"
         )
 
 

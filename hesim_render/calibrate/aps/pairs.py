@@ -25,10 +25,9 @@ from hesim_render.calibrate.aps.light_curve import (
 )
 from hesim_render.calibrate.aps.long_series import Long, long_series, stuck_pixels
 from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
-from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, Levels, both_levels
+from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, Levels, both_levels, require_one_colour
 from hesim_render.calibrate.aps.pairs_required import (
     require_dark_noise,
-    require_one_colour,
     require_series_below_well,
     require_steady_light,
 )
@@ -166,7 +165,7 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     long_dark, long_lit = long_series(pairs, progress)
     require_dark_noise(pairs, dark, long_dark)
     require_series_below_well(pairs, long_lit, lit, saturation)
-    require_one_colour(pairs, long_lit.mean - long_dark.mean)
+    require_one_colour(pairs.spatial_lit, long_lit.mean - long_dark.mean)
     top = float(signal[min(saturation, signal.size - 1)])
     # levels of whose variance nothing is cut off
     clear = lit.clear & (np.arange(signal.size) < saturation) & (signal > 0)

@@ -10,8 +10,6 @@ from hesim_render.calibrate.aps.long_series import Long
 from hesim_render.calibrate.aps.pair_levels import MOST_CHANGE, Levels
 from hesim_render.recording.pair_set import PairSet
 
-#: Relative differences of the places of a tile from which they are colours.
-_MOSAIC = 0.08
 #: Part of the largest temporal variance below which a brighter series is at the full well.
 _WELL_PART = 0.5
 
@@ -35,21 +33,6 @@ def require_series_below_well(pairs: PairSet, long_lit: Long, lit: Levels, satur
     if long_lit.mean.mean() >= lit.mean[saturation] and long_lit.temporal.pixel < _WELL_PART * lit.variance[saturation]:
         raise pairs.spatial_lit.error(
             f"the long series is saturated, at {long_lit.mean.mean():.0f} DN; EMVA 1288 takes it at 50 % of saturation"
-        )
-
-
-def require_one_colour(pairs: PairSet, signal: NDArray) -> None:
-    """Refuse frames whose places of a 2x2 tile have signals of their own, far apart beside the pixels' spread."""
-    rows, cols = (count - count % 2 for count in signal.shape)
-    # the four places of a tile, [place, pixel]
-    places = signal[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2).transpose(1, 3, 0, 2).reshape(4, -1)
-    middle = np.median(places, axis=1)
-    spread = np.median(np.abs(places - middle[:, None])) / 0.6745
-    if np.ptp(middle) > max(_MOSAIC * middle.mean(), 3 * spread):
-        shares = ", ".join(f"{100 * value / middle.max():.0f}" for value in middle)
-        raise pairs.spatial_lit.error(
-            f"the places of a 2x2 tile have {shares} % of the largest signal: a colour mosaic. EMVA 1288 evaluates one "
-            "colour at a time; state tile_rows: 2, tile_cols: 2 and tile_position: [row, column] in capture.yaml"
         )
 
 

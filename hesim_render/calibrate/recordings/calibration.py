@@ -10,6 +10,7 @@ import numpy as np
 
 from hesim_render.calibrate.estimate import not_identifiable
 from hesim_render.calibrate.recordings import still, target
+from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
 from hesim_render.calibrate.recordings.tally import EventTally, tally
 from hesim_render.calibrate.result import plain
@@ -124,23 +125,29 @@ def figures(
         for one in every:
             one.used &= ~hot
     of_target = target.unknown("it takes a recording of a moving target (--target)")
-    result = still.balance(tallies, lux)
+    # levels are balanced where the light and the camera are steady
+    steady = [k for k, one in enumerate(tallies) if still.unsteady(one) is None]
+    calm, calm_lux = [tallies[k] for k in steady], None if lux is None else [lux[k] for k in steady]
+    result = still.balance(calm, calm_lux)
     if moving is not None and contrast is not None:
         leak_hz = 0.0
         for _ in range(_ROUNDS):
             of_target = target.thresholds(moving, contrast, cycles_hz, leak_hz)
             if of_target.ratio["value"] is None:
                 break
-            result = still.balance_with_target(tallies, lux, moving, of_target.ratio, leak_hz)
+            result = still.balance_with_target(calm, calm_lux, moving, of_target.ratio, leak_hz)
+            if not calm:
+                break
             leak_hz = float(np.mean([leak["value"] for leak in result.leaks]))
     entries, findings = [], []
-    for k, (one, leak) in enumerate(zip(tallies, result.leaks, strict=True)):
+    leaks, changes = dict(zip(steady, result.leaks, strict=True)), not_identifiable("its rate changes (findings)")
+    for k, one in enumerate(tallies):
         rates = still.group_rates(one)
         entries.append({
             "file": Path(one.source).name, "lux": None if lux is None else lux[k], "seconds": one.seconds,
             "events": int(one.counts.sum()), "on_rate_hz": still.rate(rates, 0), "off_rate_hz": still.rate(rates, 1),
-            "on_rate_spread_rel": still.rate_spread(one, 0), "off_rate_spread_rel": still.rate_spread(one, 1),
-            "on_local_variation": still.regularity(one), "leak_rate_hz": leak,
+            "on_rate_spread_rel": rate_spread(one, 0), "off_rate_spread_rel": rate_spread(one, 1),
+            "on_local_variation": regularity(one), "leak_rate_hz": leaks.get(k, changes),
         })  # fmt: skip
         if problem := still.not_still(one):
             findings.append({"file": Path(one.source).name, "text": problem})

@@ -40,6 +40,14 @@ _EARLY, _INTERVALS = 1 / 64, 4.0
 _LEAST_REST = 0.1
 #: Gaps above the median differ by this much at most, where all pixels see the same rests.
 _SAME_RESTS = 0.2
+#: Crossings of a level by noise that has stayed below it, over a mean velocity of 1: the density of the noise over its
+#: chance to be below, times the share of them that come alone. That share was counted on simulated noise.
+_GRID = np.linspace(-40.0, 10.0, 2001)
+_RATE = np.exp(-0.5 * _GRID**2 - special.log_ndtr(_GRID)) / np.sqrt(2 * np.pi) * np.interp(
+    _GRID, [-1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 3.0, 5.0], [1.12, 1.035, 0.98, 0.92, 0.88, 0.87, 0.9, 1.0]
+)  # fmt: skip
+#: Their integral from the lowest level of `_GRID`.
+_CROSSED = np.append(0.0, np.cumsum(0.5 * (_RATE[1:] + _RATE[:-1]) * np.diff(_GRID)))
 
 
 class Ramps(NamedTuple):
@@ -100,6 +108,16 @@ class Overshoot(NamedTuple):
     quantiles: NDArray[np.float64]
 
 
+def _faster(x: NDArray) -> NDArray[np.float64]:
+    """Mean of the positive part of a normal deviate plus x."""
+    return np.asarray(np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi) + x * special.ndtr(x))
+
+
+def _crossed(level: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Integral of the crossings (`_RATE`) up to a level, in units of the noise."""
+    return np.asarray(np.interp(level, _GRID, _CROSSED))
+
+
 def highest(noise: NDArray, cutoff_hz: NDArray, ramps: Ramps, times_s: NDArray, is_over: bool) -> NDArray[np.float64]:
     """Chance that the level has stayed below each of `_LEVELS`, in units of the noise: [..., time, level].
 
@@ -127,31 +145,17 @@ def highest(noise: NDArray, cutoff_hz: NDArray, ramps: Ramps, times_s: NDArray, 
     return np.asarray(special.ndtr(u) * np.exp(-crossings))
 
 
-def _density(x: NDArray) -> NDArray[np.float64]:
-    return np.asarray(np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi))
-
-
-def _faster(x: NDArray) -> NDArray[np.float64]:
-    """Mean of the positive part of a normal deviate plus x."""
-    return np.asarray(_density(x) + x * special.ndtr(x))
-
-
-#: Crossings of a level by noise that has stayed below it, over a mean velocity of 1: the density of the noise over its
-#: chance to be below, times the share of them that come alone. That share was counted on simulated noise.
-_GRID = np.linspace(-40.0, 10.0, 2001)
-_RATE = np.exp(-0.5 * _GRID**2 - special.log_ndtr(_GRID)) / np.sqrt(2 * np.pi) * np.interp(
-    _GRID, [-1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 3.0, 5.0], [1.12, 1.035, 0.98, 0.92, 0.88, 0.87, 0.9, 1.0]
-)  # fmt: skip
-_CROSSED = np.append(0.0, np.cumsum(0.5 * (_RATE[1:] + _RATE[:-1]) * np.diff(_GRID)))
-
-
-def _crossed(level: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.interp(level, _GRID, _CROSSED))
-
-
 def _mean(chance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean of a law [..., level] in units of the noise."""
     return np.asarray(_LEVELS[-1] - np.trapezoid(chance, _LEVELS, axis=-1))
+
+
+def _median(counts: NDArray, part: float = 0.5) -> float:
+    """Place of a quantile in a histogram of times with even logarithmic steps, µs; 0 without any."""
+    if counts.sum() == 0:
+        return 0.0
+    below = np.append(0.0, np.cumsum(counts))
+    return float(2.0 ** (np.interp(part * below[-1], below, np.arange(below.size)) / STEPS_PER_OCTAVE))
 
 
 def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] | None:
@@ -206,12 +210,9 @@ def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] 
     return result[0]._replace(is_noisy=is_noisy), result[1]._replace(is_noisy=is_noisy)
 
 
-def _median(counts: NDArray, part: float = 0.5) -> float:
-    """Place of a quantile in a histogram of times with even logarithmic steps, µs; 0 without any."""
-    if counts.sum() == 0:
-        return 0.0
-    below = np.append(0.0, np.cumsum(counts))
-    return float(2.0 ** (np.interp(part * below[-1], below, np.arange(below.size)) / STEPS_PER_OCTAVE))
+def _leaks(rest: Rest) -> NDArray[np.float64]:
+    """Leaks among which the likelihood decides, over that of the still scenes."""
+    return np.ones(1) if rest.ramps.drift == 0 else _LEAK
 
 
 def overshoots(top: Rest, bottom: Rest, places: int) -> tuple[Overshoot, Overshoot]:
@@ -251,10 +252,6 @@ def overshoots(top: Rest, bottom: Rest, places: int) -> tuple[Overshoot, Oversho
         spread = float(np.sqrt(of_leak @ (leaks - drift) ** 2))
         result.append(Overshoot(value, low, high, drift, spread, quantiles + value - quantiles.mean()))
     return result[0], result[1]
-
-
-def _leaks(rest: Rest) -> NDArray[np.float64]:
-    return np.ones(1) if rest.ramps.drift == 0 else _LEAK
 
 
 def _posterior(rest: Rest) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

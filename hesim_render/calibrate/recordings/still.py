@@ -37,8 +37,6 @@ _RATIO_SHIFT, _LEAK_SHIFT = 1.0, 3.0
 UNSURE_LEAK = 0.1
 #: Range in which the ratio of the thresholds is taken to be where nothing tells it.
 _RATIO = (0.5, 2.0)
-#: Pairs of ON intervals that the local variation needs.
-_LEAST_PAIRS = 200
 
 
 def group_rates(tally: EventTally) -> NDArray[np.float64]:
@@ -60,43 +58,6 @@ def rate(rates: NDArray[np.float64], polarity: int) -> dict[str, Any]:
     if rates[polarity, 0] == 0:
         return {"value": 0.0, "unit": "Hz", "note": "no event"}
     return estimated(rates[polarity, 0], float(jackknife(rates[polarity])), "Hz", GROUPS)
-
-
-def rate_spread(tally: EventTally, polarity: int) -> dict[str, Any]:
-    """Standard deviation of the rates over pixels, relative: the covariance of both halves of the time, in which the
-    counting of events has no part. The error is that of a jackknife over groups of pixels.
-    """
-    halves = tally.counts[polarity].astype(np.float64)
-    if halves[:, tally.used].sum() < 2 * _EVENTS_TO_BE_SILENT:
-        return not_identifiable(f"{int(halves[:, tally.used].sum())} events in all")
-    # sums of each group of pixels: number, counts of both halves, and their product, [4, group]
-    sums = np.array([tally.by_group(v) for v in (np.ones(tally.pixels), *halves, halves[0] * halves[1])])
-
-    def relative(s: NDArray[np.float64]) -> NDArray[np.float64]:
-        means = s[1:] / s[0]
-        return (means[2] - means[0] * means[1]) / np.maximum(means[0] * means[1], 1e-300)
-
-    whole = float(relative(sums.sum(axis=1)))
-    # the same without each group, for the jackknife
-    parts = relative(sums.sum(axis=1)[:, None] - sums)
-    error = float(jackknife(np.append(whole, parts)))
-    if whole <= 2 * error:
-        limit = float(np.sqrt(max(whole + 2 * error, 0.0)))
-        return {"value": 0.0, "upper_limit": limit, "note": "the pixels scatter no more than counting makes them"}
-    return estimated(np.sqrt(whole), error / (2 * np.sqrt(whole)), "relative std", GROUPS)
-
-
-def regularity(tally: EventTally) -> dict[str, Any]:
-    """Local variation of a pixel's ON intervals [shinomoto2003]: 1 for a Poisson process, 0 for equal intervals."""
-    of_groups, variation = tally.by_group(tally.pairs), tally.by_group(tally.variation)
-    pairs = int(of_groups.sum())
-    if pairs < _LEAST_PAIRS:
-        return not_identifiable(f"{pairs} pairs of successive ON intervals; {_LEAST_PAIRS} are needed")
-    # mean over pairs of intervals, then the same without each group
-    whole = variation.sum() / pairs
-    parts = (variation.sum() - variation) / np.maximum(pairs - of_groups, 1)
-    error = float(jackknife(np.append(whole, parts)))
-    return estimated(whole, error, "", GROUPS)
 
 
 class LeakBalance(NamedTuple):
@@ -128,6 +89,9 @@ def balance(tallies: Sequence[EventTally], lux: Sequence[float] | None) -> LeakB
     tallies : recordings of still scenes.
     lux : illuminance of each, or None.
     """
+    if not tallies:
+        reason = not_identifiable("the rate of every recording changes (findings)")
+        return LeakBalance(reason, [], reason, reason)
     rates = np.array([group_rates(one) for one in tallies])  # [recording, polarity, k]
     if lux is None:
         reason = not_identifiable("it takes the illuminances (--lux), or a moving target (--target)")
@@ -167,6 +131,8 @@ def balance_with_target(
     ratio : θ₋/θ₊, mean over pixels, as an entry of the result.
     leak_hz : leak of a pixel while the target moved, Hz.
     """
+    if not tallies:
+        return balance(tallies, lux)._replace(ratio=ratio)
     on, off = moving.per_pixel().astype(np.float64)
     # pixels that the target passed over
     seen = (off > 0.25 * np.median(off[off > 0])) & moving.used
@@ -289,8 +255,8 @@ def silent_share(tallies: Sequence[EventTally]) -> dict[str, Any]:
     return share(int(np.count_nonzero(total == 0)), total.size)
 
 
-def not_still(tally: EventTally) -> str | None:
-    """A line that says that a recording is not one of a still scene; None where its rate is steady enough.
+def unsteady(tally: EventTally) -> str | None:
+    """A line that says that the rate of a recording changes; None where it is steady enough.
 
     The last quarter of the slices against the first, and the largest against the mean, each beyond what counting does.
     """
@@ -308,7 +274,12 @@ def not_still(tally: EventTally) -> str | None:
             f"its rate goes from {early:.4g} to {late:.4g} Hz a pixel, at most {each.max():.4g}: the scene moves, the "
             "lamp flickers, or the camera was not settled"
         )
-    return of_a_lamp(tally)
+    return None
+
+
+def not_still(tally: EventTally) -> str | None:
+    """A line that says that a recording is not one of a still scene in steady light; None where it may be."""
+    return unsteady(tally) or of_a_lamp(tally)
 
 
 def of_a_lamp(tally: EventTally) -> str | None:
