@@ -20,7 +20,7 @@ from hesim_render.benchmark.verify import digest_of
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
 from hesim_render.core.guard import WholeFile
 from hesim_render.core.output import check_place, replacing
-from hesim_render.core.plain import finite
+from hesim_render.core.plain import as_plain
 from hesim_render.core.progress import Progress
 from hesim_render.specs.benchmark import SPLITS
 
@@ -133,7 +133,7 @@ def evaluate_benchmark(
     }
     if target is not None:
         with replacing(target) as unfinished:
-            unfinished.write_text(json.dumps(finite(result), indent=1) + "\n", encoding="utf-8")
+            unfinished.write_text(json.dumps(as_plain(result), indent=1) + "\n", encoding="utf-8")
     return result
 
 
