@@ -46,10 +46,17 @@ def traced(scene, controlled=False):
     return [tracer.trace(pixel, number, windows, rays, which, span_us=span) for span in (None, (0.0, 25_000.0))]
 
 
-@pytest.mark.parametrize("bunch", [1, pytest.param(3, marks=pytest.mark.slow), 1000])
-def test_bunches_change_no_bit(bunch, monkeypatch):
+@pytest.fixture(scope="module")
+def usual():
+    """Objects, and what is traced with bunches of the usual size."""
     scene = swarm(50)
-    first = traced(scene)
+    return scene, traced(scene)
+
+
+@pytest.mark.parametrize("bunch", [1, pytest.param(3, marks=pytest.mark.slow), 1000])
+def test_bunches_change_no_bit(bunch, usual, monkeypatch):
+    scene, first = usual
+    assert many_objects._BUNCH not in (1, 3, 1000)
     monkeypatch.setattr(many_objects, "_BUNCH", bunch)
     for one, other in zip(first, traced(scene), strict=True):
         for name in ("half_a", "half_b", "met"):
