@@ -110,7 +110,7 @@ def test_a_run_goes_on_where_another_one_stopped(reference):
     sensor = hr.load_sensor("reference-mono" if is_tick else "davis346", changes).crop(
         *((32, 24) if is_tick else (16, 12))
     )
-    half_us = 25_000 if is_tick else 8000
+    half_us = 12_500 if is_tick else 8000
     keys = [{"t_us": 0, "rotation_deg": 0}, {"t_us": 200_000, "rotation_deg": -360}]
     scene = hr.load_scene("rotating-star", {"motion": [{"object": "target", "keyframes": keys}]})
 

@@ -674,11 +674,8 @@ def test_an_environment_map_is_read_on_one_cpu(tmp_path):
 import json
 import os
 os.sched_setaffinity(0, {{min(os.sched_getaffinity(0))}})
-import hesim_render as hr
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.scene.builder import build
-from hesim_render.sources.render.camera import place_camera
-from hesim_render.sources.render.change_driven.sample_instants import STEP_PX, MotionClock
 from hesim_render.sources.scene import Scene
 shapes = {{"sky": {{"type": "envmap", "filename": r"{tmp_path / "sky.exr"}"}}}}
 print(len(build(mitsuba(), Scene.from_mitsuba(shapes).spec).scene.emitters()))
