@@ -46,7 +46,7 @@ def imports(path):
     typing_only = {
         id(child)
         for node in ast.walk(tree)
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
         for child in ast.walk(node)
     }
     found = []
@@ -147,7 +147,7 @@ def test_a_class_has_a_name_of_its_own():
     """Two things of one name cannot be distinguished in a search, a traceback or a sentence."""
     homes = {}
     for name, path in MODULES.items():
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for node in tree_of(path).body:
             if isinstance(node, ast.ClassDef):
                 homes.setdefault(node.name, []).append(name)
     assert not {name: found for name, found in homes.items() if len(found) > 1}
@@ -272,7 +272,7 @@ def test_nothing_is_replaced_run_or_left_out_until_it_is_asked_for():
     """Every function of the package that has such a parameter with a default has False."""
     found = dict.fromkeys(ASKED_FOR, 0)
     for name, path in MODULES.items():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree_of(path)):
             if not isinstance(node, ast.FunctionDef):
                 continue
             plain = [*node.args.posonlyargs, *node.args.args]
