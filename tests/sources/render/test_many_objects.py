@@ -68,7 +68,7 @@ def test_bunches_change_no_bit(bunch, usual, monkeypatch):
 
 def test_they_are_what_objects_one_by_one_are(monkeypatch):
     """The same kernel arithmetic in another order of operations: float32 rounding, and rays at an edge."""
-    scene = swarm(20)
+    scene = swarm(10)
     first = traced(scene)
     monkeypatch.setattr(moving_scene, "_FEW", 1000)
     for one, other in zip(first, traced(scene), strict=True):
