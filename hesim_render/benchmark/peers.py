@@ -24,7 +24,7 @@ from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.core.guard import printable
 from hesim_render.core.output import check_place, replacing
-from hesim_render.core.plain import finite
+from hesim_render.core.plain import as_plain
 from hesim_render.core.progress import Progress
 from hesim_render.exchange import EventStream
 from hesim_render.measure.event_distance import EventStatistics, event_distances, event_statistics
@@ -112,7 +112,7 @@ def compare_peers(
     }  # fmt: skip
     if target is not None:
         with replacing(target) as unfinished:
-            unfinished.write_text(json.dumps(finite(result), indent=1) + "\n", encoding="utf-8")
+            unfinished.write_text(json.dumps(as_plain(result), indent=1) + "\n", encoding="utf-8")
     return result
 
 

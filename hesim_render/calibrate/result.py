@@ -19,6 +19,7 @@ from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.core.guard import WholeFile
 from hesim_render.core.npz import NpzWriter
 from hesim_render.core.output import alone_in, check_place, output_errors, replacing
+from hesim_render.core.plain import as_plain
 from hesim_render.core.yaml_file import write_yaml
 
 __all__ = ["check_calibration", "plain", "read_calibration", "read_maps", "write_section"]
@@ -153,15 +154,5 @@ def check_report(calibration: str | Path, report: str | Path, overwrite: bool = 
 
 
 def plain(value: Any) -> Any:
-    """NumPy numbers and arrays as Python's, floats to nine significant digits; anything not finite becomes null."""
-    if isinstance(value, Mapping):
-        return {key if isinstance(key, int) else str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, int | np.integer):
-        return int(value)
-    if isinstance(value, float | np.floating):
-        return float(f"{value:.{_SIGNIFICANT}g}") if np.isfinite(value) else None
-    return value
+    """A value as files hold it, floats to nine significant digits."""
+    return as_plain(value, _SIGNIFICANT)

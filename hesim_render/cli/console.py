@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, is_dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -80,8 +78,10 @@ class Console:
         """
         self.text(text)
         if self.as_json:
+            from hesim_render.core.plain import as_plain
+
             known = {} if self._estimate is None else {"estimate": self._estimate}
-            say(json.dumps(_plain({"status": int(status), **known, **facts}), indent=2))
+            say(json.dumps(as_plain({"status": int(status), **known, **facts}), indent=2))
         if status:
             raise typer.Exit(int(status))
 
@@ -107,20 +107,6 @@ def facts_of(expected: object) -> dict[str, Any]:
     """The fields of an estimate, and its text."""
     fields = asdict(expected) if is_dataclass(expected) and not isinstance(expected, type) else {}
     return {"text": str(expected), **fields}
-
-
-def _plain(value: Any) -> Any:
-    """Values that JSON has; what is not a number is null."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, float) or hasattr(value, "item"):
-        number = value if isinstance(value, float) else value.item()
-        return number if not isinstance(number, float) or math.isfinite(number) else None
-    return value
 
 
 def recording_facts(recording: Recording) -> dict[str, Any]:

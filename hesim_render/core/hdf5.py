@@ -15,6 +15,10 @@ import hdf5plugin
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.guard import MOST_BYTES, reading, require_memory
 
+# Where HDF5_PLUGIN_PATH leads to Blosc, HDF5 loads it by itself, without what hdf5plugin gives it, and can make no data
+# set: it is loaded once more.
+hdf5plugin.register("blosc")
+
 #: HDF5 filters that may be needed to read: deflate, shuffle, fletcher32, LZF, Blosc.
 _FILTERS = {1, 2, 3, 32000, 32001}
 LARGEST_CHUNK_BYTES = 1 << 26

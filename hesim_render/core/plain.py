@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Mapping
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,15 +32,28 @@ class PlainState:
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
 
-def finite(node: Any) -> Any:
-    """Lists, mappings and numbers for a JSON file, which has no NaN or infinity: both become null."""
-    if isinstance(node, dict):
-        return {key: finite(value) for key, value in node.items()}
-    if isinstance(node, list):
-        return [finite(value) for value in node]
-    if isinstance(node, float):
-        return node if np.isfinite(node) else None
-    return node
+def as_plain(value: Any, digits: int = 17) -> Any:
+    """A value as JSON and YAML files hold it: NumPy's numbers and arrays as Python's, paths as text, null for a number
+    that is not finite.
+
+    Parameters
+    ----------
+    value : numbers, texts and paths, in mappings, lists, tuples and arrays.
+    digits : significant ones of floats; 17 keep every bit.
+    """
+    if isinstance(value, Mapping):
+        return {key if isinstance(key, int) else str(key): as_plain(item, digits) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [as_plain(item, digits) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.{digits}g}") if np.isfinite(value) else None
+    return value
 
 
 def to_bytes(value: Any) -> bytes:

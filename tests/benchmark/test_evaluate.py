@@ -87,6 +87,21 @@ def test_a_method_that_loses_to_doing_nothing_is_named_with_the_reason():
     assert "tick" not in verdicts(scores)[0] and not verdicts(scores[:4])
 
 
+@pytest.mark.parametrize(("task", "nothing", "measure", "idle", "reason"), [
+    ("deblur", "blurred", "raw_psnr_db", 30.5, "because little blurs"),
+    ("deblur", "blurred", "raw_psnr_db", 29.5, "blur leaves 29.5 dB, which leaves much to gain"),
+    ("interpolate", "hold", "raw_psnr_db", 30.5, "because little changes"),
+    ("interpolate", "hold", "raw_psnr_db", 29.5, "the frame before has 29.5 dB, which leaves much to gain"),
+    ("denoise", "none", "f1", 2 * 0.52 / 1.52, "so many events are signal"),
+    ("denoise", "none", "f1", 2 * 0.48 / 1.48, "most events are noise"),
+])  # fmt: skip
+def test_the_reason_is_that_of_the_value(task, nothing, measure, idle, reason):
+    """F1 without a filter is 2p/(1 + p), where p is the part of the signal."""
+    scores = [Score("c", task, nothing, 0, {measure: idle}), Score("c", task, "mine", 0, {measure: 0.5 * idle})]
+    (text,) = verdicts(scores)
+    assert reason in text.partition("Why: ")[2]
+
+
 def test_a_perfect_answer_scores_perfectly(built):
     clip = next(built.clips())
     truth = clip.sharp.raw_dn(1).astype(float)

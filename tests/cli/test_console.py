@@ -110,8 +110,9 @@ def test_the_rays_of_an_exact_run_are_near_their_estimate(capsys, tmp_path, monk
 
 
 @pytest.mark.parametrize("duration", ["0.005", pytest.param("0.06", marks=pytest.mark.slow)])
-def test_the_rays_of_a_run_are_near_their_estimate(duration, capsys, tmp_path):
+def test_the_rays_of_a_run_are_near_their_estimate(duration, capsys, tmp_path, monkeypatch):
     """A fifth of the rays of a short run are those of its first window. GEN2 has few event pixels in the region."""
+    monkeypatch.setattr("hesim_render.sources.render.audit.audit._RAYS", 300_000)  # an audit has no part in it
     for sensor, region in (("eiger", "96x64"), ("gen2", "160x128")):
         given = ["rotating-star", "--sensor", sensor, "--roi", region, "--duration", duration]
         out = tmp_path / sensor

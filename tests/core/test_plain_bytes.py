@@ -1,10 +1,13 @@
 """Plain values as bytes: what comes back is what went in, with its types and bits."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from hesim_render.core.backend import jit
-from hesim_render.core.plain import from_bytes, to_bytes
+from hesim_render.core.plain import as_plain, from_bytes, to_bytes
 
 EVENTS = np.array([(2**40, 3, 4, -1)], np.dtype([("t_us", "i8"), ("x", "u2"), ("y", "u2"), ("polarity", "i1")]))
 VALUES = [
@@ -58,3 +61,10 @@ def test_other_values_are_refused(value):
 def test_bytes_name_no_other_type_than_those_of_arrays(name):
     with pytest.raises(TypeError, match=name):
         from_bytes(to_bytes(type(name, (), {})))
+
+
+def test_values_for_files_keep_every_bit_and_have_no_number_that_json_lacks():
+    given = {"a": (1 / 3, np.float32(0.1)), "b": [np.inf, -np.nan], 3: Path("x") / "y", "c": np.array([2, 5], np.uint8)}
+    expected = {"a": [1 / 3, 0.10000000149011612], "b": [None, None], 3: "x/y", "c": [2, 5]}
+    assert as_plain(given) == expected and json.loads(json.dumps(as_plain(given)["a"])) == expected["a"]
+    assert as_plain(np.pi, 5) == 3.1416 and as_plain(np.True_) is True and as_plain({np.str_("k"): None}) == {"k": None}

@@ -85,11 +85,11 @@ def events(
     arrays = {"signal_dn": signal, "n_on": on, "n_off": off, "n_trials": trials}
     if dark:
         arrays["dark_n_on"], arrays["dark_n_off"] = draw(np.zeros((size, size)), 0.0, trials)
-    np.savez_compressed(folder / "evs_static.npz", **arrays)
+    np.savez(folder / "evs_static.npz", **arrays)
     if steps:
         contrast = theta * np.linspace(-2, 2, 21)
         counts = [draw(np.full((size, size), steps_at), step, step_trials) for step in contrast]
-        np.savez_compressed(
+        np.savez(
             folder / "evs_steps.npz", contrast=contrast, signal_dn=steps_at, n_trials=step_trials,
             n_on=np.stack([on for on, _ in counts]), n_off=np.stack([off for _, off in counts]),
         )  # fmt: skip

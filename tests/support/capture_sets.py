@@ -64,9 +64,7 @@ def write_frames(
 
 
 def save_frames(folder, name, frames, exposures_s, **more):
-    np.savez_compressed(
-        folder / f"{name}.npz", frames=frames, exposures_us=np.rint(np.array(exposures_s) * 1e6), **more
-    )
+    np.savez(folder / f"{name}.npz", frames=frames, exposures_us=np.rint(np.array(exposures_s) * 1e6), **more)
 
 
 def write_events(
@@ -93,7 +91,7 @@ def write_events(
     arrays = {"signal_dn": signal, "n_on": on, "n_off": off, "n_trials": trials}
     if dark:
         arrays["dark_n_on"], arrays["dark_n_off"] = draw(np.zeros_like(signal))
-    np.savez_compressed(folder / "evs_static.npz", **arrays)
+    np.savez(folder / "evs_static.npz", **arrays)
     return arrays
 
 
@@ -102,4 +100,4 @@ def change(file, **arrays):
     with np.load(file, allow_pickle=True) as data:
         found = {name: data[name] for name in data.files}
     found |= arrays
-    np.savez_compressed(file, **{name: value for name, value in found.items() if value is not None})
+    np.savez(file, **{name: value for name, value in found.items() if value is not None})

@@ -65,8 +65,8 @@ def shoot(lit):
 
 
 exposures_us = np.rint(t_s * 1e6).astype(np.int64)
-np.savez_compressed(f"{arg.out}/aps_dark.npz", frames=shoot(False), exposures_us=exposures_us)
-np.savez_compressed(f"{arg.out}/aps_lit.npz", frames=shoot(True), exposures_us=exposures_us)
+np.savez(f"{arg.out}/aps_dark.npz", frames=shoot(False), exposures_us=exposures_us)
+np.savez(f"{arg.out}/aps_lit.npz", frames=shoot(True), exposures_us=exposures_us)
 
 # ---- EVS: sigma_n = sqrt(2((b3 I)^2 + b4^2 + 2 b5 b3 I b4)) / (b1 I + b2), theta = b0 Theta, one draw a trial
 THETA, N = 0.75e-3, 20000
@@ -90,12 +90,10 @@ def draw(i, contrast=0.0, trials=N):
 
 on, off = draw(signal)
 don, doff = draw(np.zeros((S, S)))
-np.savez_compressed(
-    f"{arg.out}/evs_static.npz", signal_dn=signal, n_on=on, n_off=off, n_trials=N, dark_n_on=don, dark_n_off=doff
-)
+np.savez(f"{arg.out}/evs_static.npz", signal_dn=signal, n_on=on, n_off=off, n_trials=N, dark_n_on=don, dark_n_off=doff)
 contrast = theta * np.linspace(-2, 2, 21)
 steps = [draw(np.full((S, S), 20.0), c, 200) for c in contrast]
-np.savez_compressed(
+np.savez(
     f"{arg.out}/evs_steps.npz",
     contrast=contrast,
     signal_dn=20.0,
@@ -129,7 +127,7 @@ json.dump(
 gauge = blc.mean(1, keepdims=True)  # row means belong to N_row
 n_row = row + gauge[:, 0]
 black = n_row.mean()
-np.savez_compressed(
+np.savez(
     f"{arg.out}/truth_maps.npz",
     black=black,
     n_row=n_row - black,

@@ -126,22 +126,7 @@ class CubeFlux(WindowByWindow):
         return min(_MOST_INSTANTS, max(1, ceil(seconds * speed / _STEP_PX)))
 
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
-        """Mean Φ of each listed pixel over its own interval, e⁻/s.
-
-        Parameters
-        ----------
-        pixel : [n], mosaic indices.
-        begin_us, end_us : [n] or one for all, µs.
-
-        Returns
-        -------
-        half_a, half_b : the same Dr.Jit Float [n], because a cube has no Monte-Carlo error.
-
-        Raises
-        ------
-        RangeError
-            If a pixel lies outside the region or an interval ends before it begins.
-        """
+        """See `FluxSource.mean_flux`; both halves are the same, as a cube has no Monte-Carlo error."""
         import drjit as dr
 
         types = jit()

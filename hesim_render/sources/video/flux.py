@@ -173,18 +173,10 @@ class VideoFlux(WindowByWindow, Untraced):
         return self.clock.inner(self.clock.middle_us, begin_us, end_us)
 
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
-        """Mean Φ of each listed pixel over its own interval, which may span several pictures.
+        """See `FluxSource.mean_flux`; an interval may span several pictures.
 
-        The first picture is held before its time, the last one after its time.
-
-        Returns
-        -------
-        half_a, half_b : the same Dr.Jit Float [n], e⁻/s, because a video has no Monte-Carlo error.
-
-        Raises
-        ------
-        RangeError
-            If a pixel lies outside the region or an interval ends before it begins.
+        The first picture is held before its time, the last one after its time. Both halves are the same, as a video has
+        no Monte-Carlo error.
         """
         import drjit as dr
 

@@ -72,13 +72,13 @@ def test_static_pixels_are_the_same_to_the_bit_in_every_tick_and_frame():
 @pytest.mark.parametrize("name", [pytest.param("rotating-star", marks=pytest.mark.slow), "camera-sweep"])
 def test_flux_does_not_depend_on_what_was_asked_for_before(name):
     scene = hr.load_scene(name)
-    source = ChangeDrivenFlux(scene, noisy(48, 36), seed=3)
+    source = ChangeDrivenFlux(scene, noisy(32, 24), seed=3)
     pixels = source.sensor.layout.evs_pixel.ravel()
     whole = fluxes(source, 0, 50_000)
     again = fluxes(source, 0, 50_000)
     np.testing.assert_array_equal(whole, again)
     # two runs one after the other, the later one first, another list of pixels in between
-    other = ChangeDrivenFlux(scene, noisy(48, 36), seed=3)
+    other = ChangeDrivenFlux(scene, noisy(32, 24), seed=3)
     later = fluxes(other, 26_000, 50_000)
     some = np.random.default_rng(1).permutation(pixels)[:500]
     part = fluxes(other, 0, 50_000, some)
@@ -110,7 +110,7 @@ def test_a_run_goes_on_where_another_one_stopped(reference):
     sensor = hr.load_sensor("reference-mono" if is_tick else "davis346", changes).crop(
         *((32, 24) if is_tick else (16, 12))
     )
-    half_us = 25_000 if is_tick else 8000
+    half_us = 12_500 if is_tick else 8000
     keys = [{"t_us": 0, "rotation_deg": 0}, {"t_us": 200_000, "rotation_deg": -360}]
     scene = hr.load_scene("rotating-star", {"motion": [{"object": "target", "keyframes": keys}]})
 

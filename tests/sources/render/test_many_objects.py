@@ -46,10 +46,17 @@ def traced(scene, controlled=False):
     return [tracer.trace(pixel, number, windows, rays, which, span_us=span) for span in (None, (0.0, 25_000.0))]
 
 
-@pytest.mark.parametrize("bunch", [1, pytest.param(3, marks=pytest.mark.slow), 1000])
-def test_bunches_change_no_bit(bunch, monkeypatch):
+@pytest.fixture(scope="module")
+def usual():
+    """Objects, and what is traced with bunches of the usual size."""
     scene = swarm(50)
-    first = traced(scene)
+    return scene, traced(scene)
+
+
+@pytest.mark.parametrize("bunch", [1, pytest.param(3, marks=pytest.mark.slow), 1000])
+def test_bunches_change_no_bit(bunch, usual, monkeypatch):
+    scene, first = usual
+    assert many_objects._BUNCH not in (1, 3, 1000)
     monkeypatch.setattr(many_objects, "_BUNCH", bunch)
     for one, other in zip(first, traced(scene), strict=True):
         for name in ("half_a", "half_b", "met"):
@@ -61,7 +68,7 @@ def test_bunches_change_no_bit(bunch, monkeypatch):
 
 def test_they_are_what_objects_one_by_one_are(monkeypatch):
     """The same kernel arithmetic in another order of operations: float32 rounding, and rays at an edge."""
-    scene = swarm(20)
+    scene = swarm(10)
     first = traced(scene)
     monkeypatch.setattr(moving_scene, "_FEW", 1000)
     for one, other in zip(first, traced(scene), strict=True):
