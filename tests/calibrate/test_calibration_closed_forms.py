@@ -120,6 +120,17 @@ def test_goodness_of_the_variance_fit(more):
     assert found.p_value == pytest.approx(ndtr(-deviation), rel=1e-4)
 
 
+@pytest.mark.parametrize(("chi2", "chance", "seen"), [(2.098, 1e-30, False), (2.102, 1e-30, True), (2.102, 0.5, False)])
+def test_variances_scatter_too_much_from_a_twentieth_on(chi2, chance, seen):
+    """χ² of 2 is expected: 5 % more is 2.1; of four positions the chance of any counts."""
+    good = SimpleNamespace(chi2_per_dof=2.0, expected_chi2=2.0, p_value=0.3)
+    wide = SimpleNamespace(chi2_per_dof=chi2, expected_chi2=2.0, p_value=chance)
+    told = frame_checks._scatter(SimpleNamespace(fits={(0, 0): good, (0, 1): good, (1, 0): wide, (1, 1): good}))
+    assert (told is not None) is seen
+    if told is not None:
+        assert "χ²/dof 2.102 at position (1, 0)" in told.text and told.p_value == pytest.approx(4e-30)
+
+
 def test_dark_current_is_the_mean_of_good_pixels():
     rates = np.array([[60.0, 64.0, 900.0], [68.0, 72.0, 0.0]])
     none = np.zeros((2, 3), bool)
