@@ -268,6 +268,30 @@ def test_intervals_are_drawn_as_a_density():
     assert edges[0] == 1 and edges[-1] < 3000 and axes.lines[0].get_xdata()[0] == 130.0
 
 
+def test_each_page_of_the_pdf_is_a4_and_has_its_number_in_the_lower_margin():
+    """Right-aligned with the text, in the middle of the margin; a thin line below each row of a table."""
+    made, pages = pdf.Document(io.BytesIO(), "t"), []
+    made._pages = SimpleNamespace(savefig=pages.append, close=lambda: None)
+    for k in range(90):
+        made.text(f"line {k}")
+    made.table(SimpleNamespace(title="A table", head=("name",), rows=[("a",), ("b",)], widths=(1.0,)))
+    made.close()
+    assert len(pages) == 2
+    for number, page in enumerate(pages, 1):
+        assert page.get_size_inches() * 25.4 == pytest.approx((210, 297), abs=0.1)
+        mark = next(text for text in page.texts if text.get_text() == str(number))
+        assert mark.get_ha() == "right" and 6 <= mark.get_fontsize() <= 8
+        assert np.array(mark.get_position()) * (595, 842) == pytest.approx((595 - 42, 21))
+        assert [text for text in page.texts if text.get_text().startswith(("line", "name"))]
+    for line in pages[1].artists:
+        assert np.array(line.get_xdata()) * 595 == pytest.approx([42, 595 - 42]) and line.get_linewidth() < 0.5
+    lows = [842 * line.get_ydata()[0] for line in pages[1].artists]
+    tops = {text.get_text(): 842 * text.get_position()[1] for text in pages[1].texts}
+    # each line lies between the foot of its row, 6.3 · 1.32 below its top, and the next row
+    for low, above, below in zip(lows, ("name", "a", "b"), ("a", "b", None), strict=True):
+        assert low <= tops[above] - 6.3 * 1.32 and (below is None or low > tops[below])
+
+
 def test_pages_of_the_pdf_hold_their_lines(monkeypatch):
     """No line over the margins of 42 pt or over another one; a table that goes on has its head on each page."""
     lines = []
