@@ -718,6 +718,17 @@ def test_a_flickering_pixel_has_the_chance_of_the_time_in_which_it_fires():
     assert np.all(found.on[~bad] == 0) and np.all(found.firing_share[~bad] == 1)
 
 
+def test_a_pixel_that_is_known_in_one_light_alone_is_hot_or_silent():
+    """Nothing tells whether its rate changes: no dark capture, no parts."""
+    static = lone_pixel(9000, 40)
+    static.n_on[2, 3] = static.n_off[2, 3] = 0
+    bad = np.zeros((24, 24), bool)
+    bad[5, 7] = bad[2, 3] = True
+    found = classify_event_defects(static, bad, None)
+    assert found.kind[5, 7] == Defect.HOT and found.kind[2, 3] == Defect.STUCK
+    assert found.on[5, 7] == pytest.approx((9000 - 40) / TRIALS, rel=0.01)
+
+
 def test_without_maps_of_frames_there_is_no_signal_at_event_pixels(tmp_path, monkeypatch):
     """No calibration yet, none at all, or one of events alone; and pixels whose filter no frame pixel has."""
     (tmp_path / "events.yaml").write_text("")

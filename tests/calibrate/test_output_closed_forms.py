@@ -214,6 +214,59 @@ def test_findings_of_emva_captures_begin_at_their_limits():
     assert "light of the long series" not in named(pairs=other)  # beyond the brightest clear level
 
 
+def test_findings_of_emva_captures_have_their_figures_in_their_units():
+    """Each number of each text, from those given: per cent, DN, electrons."""
+    given = calibration()
+    curve = SimpleNamespace(
+        **{**vars(given.curve), "light_rms": 0.0123, "offset": 3.0, "at": lambda x: 0.22 * (x + 2) * 1.013}
+    )
+    line = SimpleNamespace(cycles_per_row=0.125, cycles_per_col=0.25, rms_dn=0.37)
+    spectrum = SimpleNamespace(lines=[line] * 4, correlated=True, correlation=0.045)
+    lag = SimpleNamespace(exposure_s=np.arange(16.0), change=np.full(16, 0.62), variance=np.array([0.213]))
+    black = SimpleNamespace(**{**vars(given.black), "rms": 0.51})
+    mean = np.full((14, 22), 112.0)
+    mean[3, 5] = 0.4
+    lit, dark = (SimpleNamespace(**vars(one)) for one in (given.long_lit, given.long_dark))
+    lit.mean, dark.mean = mean, given.long_dark.mean.copy()
+    dark.mean[1, 2:4] = 255.0
+    once = SimpleNamespace(exposure_s=0.0025)
+    pairs = SimpleNamespace(**{**vars(given.pairs), "is_dark_once": True, "dark": [once], "long": [0, 1, 2]})
+    pairs.spatial_lit = SimpleNamespace(photons=250.0, label="250 photons")
+    texts = {
+        finding.check: finding.text
+        for finding in findings(
+            calibration(curve=curve, noise_spectrum=spectrum, dark=lag, black=black, col=(0.49, 0.03), level_rms=0.0231,
+                        pairs=pairs, long_lit=lit, long_dark=dark, dark_noise_is_rounded_off=True)
+        )
+    }  # fmt: skip
+    more = (mean.mean() - dark.mean.mean()) / (0.22 * 252 * 1.013) - 1
+    noise = (9.4 / (14 * 22) + 0.62 / 14 + 0.49 / 22) / 2
+    for check_, figures in {
+        "linearity": f"the mean bends: {100 * (302 * 1.013 / 303 - 1):+.2g} %",
+        "light offset": "has 3 photons more",
+        "light": "scatters by 1.2 % from",
+        "variance": "scatter by 2.3 % about the polynomial, more than chance (χ²/dof 3.2)",
+        "row noise": f"rows change together from frame to frame by {np.sqrt(0.62):.3f} DN ({np.sqrt(0.62) / K:.1f} e-)",
+        "column noise": f"columns change together from frame to frame by 0.7 DN ({0.7 / K:.1f} e-)",
+        "interference": "0.125 periods a row and 0.25 a column has a new phase in each frame, 0.37 DN rms",
+        "read noise": "a correlation of +0.045",
+        "column pattern": "0.35 DN rms",
+        "black level": f"changes by {np.sqrt(0.51**2 - noise):.2g} DN",
+        "image lag": "is 0.62 DN brighter",
+        "light of the long series": f"has {100 * more:.2g} % more light",
+        "stuck pixels": "2 pixels are at full scale in the dark, 1 at 0 DN",
+        "dark noise": "down to 0.213 DN²",
+        "dark frames": "one exposure, 2500 µs",
+        "long series": "of 3 long series in the light, that of 250 photons",
+    }.items():
+        assert figures in texts[check_], texts[check_]
+    below = findings(calibration(long_lit=SimpleNamespace(**{**vars(given.long_lit), "mean": np.full((14, 22), 90.0)})))
+    less = 100 * (1 - 50 / (0.22 * 252 * 1.0021))
+    assert (
+        f"has {less:.2g} % less light" in {finding.check: finding.text for finding in below}["light of the long series"]
+    )
+
+
 def test_histograms_of_noise_are_densities_beside_that_of_their_law():
     """20,000 values about the mean of 5 frames; their law is normal with the polynomial's variance, 1/12 and rows."""
     rng = np.random.default_rng(6)

@@ -437,6 +437,19 @@ def test_chance_is_the_share_of_windows_of_still_light_with_an_event():
     assert np.isnan(limits.false_share(bench, steady, 341, 0, good))
 
 
+def test_simulated_captures_are_seven_tenths_of_the_progress_of_a_report(monkeypatch, tmp_path):
+    told = []
+
+    def simulated(sensor, events, frames, size, seed, progress):
+        progress("event pixels", 0.5)
+        raise SpecError("enough")
+
+    monkeypatch.setattr(simulate, "simulate_captures", simulated)
+    with pytest.raises(SpecError, match="enough"):
+        run.make_report(["gen2"], tmp_path / "r", progress=lambda what, part: told.append((what, part)))
+    assert told[-1] == ("event pixels", pytest.approx(0.35))
+
+
 def test_an_s_curve_goes_from_chance_to_one():
     curve = SCurve(9.0, None, None, None, 0.1, {}, 0.3, 0.05, 40)
     np.testing.assert_allclose(curve.at(np.array([-9.0, 0.3, 0.35, 9.0])), [0.1, 0.55, 0.1 + 0.9 * norm.cdf(1), 1])
@@ -615,19 +628,19 @@ def test_a_report_has_each_table_once_and_a_page_for_each_kind_of_pixels(kinds, 
 @pytest.mark.parametrize("has_photons", (True, False))
 def test_figures_of_frames_have_the_light_they_were_measured_in(has_photons):
     """Levels of 10 to 100 % of saturation, of which the last is not clear; a long series at half of it."""
-    light = np.linspace(100.0, 1000.0, 10) * (1.0 if has_photons else 1e-6)
+    light = np.linspace(12.3456, 123.456, 10) * (1.0 if has_photons else 1e-6)
     result = SimpleNamespace(
         light=light, signal=np.linspace(20.0, 200.0, 10), top_dn=200.0, clear=np.arange(10) < 9,
         pairs=SimpleNamespace(
             has_photons=has_photons,
-            spatial_lit=SimpleNamespace(photons=500.0 if has_photons else None, exposure_s=5e-4),
+            spatial_lit=SimpleNamespace(photons=61.728 if has_photons else None, exposure_s=6.1728e-5),
         ),
     )  # fmt: skip
     lights = emva.FrameFigures(result, {}, []).lights
     assert set(lights) == set(FRAMES)
     if has_photons:
-        assert lights["K"] == "100 to 700 photons" and lights["full_well_e"] == "up to 1000 photons"
-        assert lights["prnu_percent"] == "500 photons, and dark" and lights["dsnu_e"] == "dark"
-        assert lights["linearity_error_percent"] == "100 to 900 photons"
+        assert lights["K"] == "12.3 to 86.4 photons" and lights["full_well_e"] == "up to 123 photons"
+        assert lights["prnu_percent"] == "61.7 photons, and dark" and lights["dsnu_e"] == "dark"
+        assert lights["linearity_error_percent"] == "12.3 to 111 photons"
     else:
-        assert lights["K"] == "0.1 to 0.7 ms" and lights["prnu_percent"] == "0.5 ms, and dark"
+        assert lights["K"] == "0.0123 to 0.0864 ms" and lights["prnu_percent"] == "0.0617 ms, and dark"
