@@ -223,7 +223,7 @@ def test_findings_of_emva_captures_have_their_figures_in_their_units():
     line = SimpleNamespace(cycles_per_row=0.125, cycles_per_col=0.25, rms_dn=0.37)
     spectrum = SimpleNamespace(lines=[line] * 4, correlated=True, correlation=0.045)
     lag = SimpleNamespace(exposure_s=np.arange(16.0), change=np.full(16, 0.62), variance=np.array([0.213]))
-    black = SimpleNamespace(**{**vars(given.black), "rms": 0.51})
+    black = SimpleNamespace(**{**vars(given.black), "rms": 0.61})
     mean = np.full((14, 22), 112.0)
     mean[3, 5] = 0.4
     lit, dark = (SimpleNamespace(**vars(one)) for one in (given.long_lit, given.long_dark))
@@ -251,7 +251,7 @@ def test_findings_of_emva_captures_have_their_figures_in_their_units():
         "interference": "0.125 periods a row and 0.25 a column has a new phase in each frame, 0.37 DN rms",
         "read noise": "a correlation of +0.045",
         "column pattern": "0.35 DN rms",
-        "black level": f"changes by {np.sqrt(0.51**2 - noise):.2g} DN",
+        "black level": f"changes by {np.sqrt(0.61**2 - noise):.2g} DN",
         "image lag": "is 0.62 DN brighter",
         "light of the long series": f"has {100 * more:.2g} % more light",
         "stuck pixels": "2 pixels are at full scale in the dark, 1 at 0 DN",
