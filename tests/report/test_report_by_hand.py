@@ -10,7 +10,7 @@ from scipy import special
 from scipy.stats import norm
 
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, run, s_curves, simulate
+from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, run, s_curves, simulate, texts
 from hesim_render.report.bench import EventBench
 from hesim_render.report.definitions import FRAMES
 from hesim_render.report.estimates import crossing, log_estimated, mean_error, quantile, whole_us_quantile
@@ -435,6 +435,50 @@ def test_chance_is_the_share_of_windows_of_still_light_with_an_event():
     good[0] = False
     assert limits.false_share(bench, steady, 100, 0, good) == pytest.approx(3 / 12)
     assert np.isnan(limits.false_share(bench, steady, 341, 0, good))
+
+
+def test_tables_against_light_have_the_figures_of_each_light_and_temperature():
+    """Values with three digits and their intervals, shares in per cent with 1.96 errors, upper limits, gaps."""
+
+    def entry(value):
+        return {"value": value, "interval_95": [0.9 * value, 1.2 * value], "unit": "µs"}
+
+    def steady(lux, celsius, on):
+        return SimpleNamespace(lux=lux, temperature_c=celsius, rates=[entry(on), {"value": 0.0, "upper_limit": 0.0123}])
+
+    def answer(lux, celsius, latency):
+        jitter = {"value": None, "reason": "too few"}
+        return SimpleNamespace(lux=lux, temperature_c=celsius, contrast=0.4567, latency=entry(latency), jitter=jitter)
+
+    found = SimpleNamespace(lux=np.array([5.0, 80.0]), share=np.array([0.1234, 0.987]), error=np.array([0.02, 0.0031]))
+    measured = SimpleNamespace(
+        latencies=([answer(80.0, 25.0, 1234.5), answer(5.0, 25.0, 23456.0)], [answer(5.0, 40.0, 7.0)]),
+        backgrounds=[steady(5.0, 40.0, 3.21987), steady(5.0, 25.0, 0.5)], ranges=[found, None],
+        entries=[
+            SimpleNamespace(
+                key=key, name="", value=value, lux=lux, contrast=contrast, temperature_c=celsius, pixels=count
+            )
+            for key, value, lux, contrast, celsius, count in (
+                ("dead_time", entry(0.71236), None, None, 31.5, 7), ("hot", entry(3.0), None, None, None, 5),
+                ("latency", {"value": None, "reason": "no jumps"}, None, 0.3456, None, 11),
+                ("latency", entry(5.0), 3.0, None, None, 1), ("jitter", entry(5.0), None, None, None, 1),
+            )
+        ],
+    )  # fmt: skip
+    figures_, light, definitions = texts.event_tables(measured)
+    assert [row[1:] for row in figures_.rows] == [
+        ("0.7124", "0.6411 to 0.8548", "µs", "31.5 °C", "7"),
+        ("3", "2.7 to 3.6", "µs", "steady, all", "5"),
+        ("–", "", "no jumps", "steps of 34.6 %", "11"),
+    ]
+    assert light.title == "Against light (latency of steps of 45.7 %)" and len(light.head) == len(light.widths) == 9
+    assert light.rows == [
+        ("5, 25 °C", "0.5 (0.45 to 0.6)", "< 0.0123", "23500 (21100 to 28100)", "–", "", "", "12.3 ± 3.9", ""),
+        ("80, 25 °C", "", "", "1230 (1110 to 1480)", "–", "", "", "98.7 ± 0.61", ""),
+        ("5, 40 °C", "3.22 (2.9 to 3.86)", "< 0.0123", "", "", "7 (6.3 to 8.4)", "–", "12.3 ± 3.9", ""),
+    ]
+    for table in (figures_, light, definitions):
+        assert sum(table.widths) == pytest.approx(1) and {len(row) for row in table.rows} == {len(table.head)}
 
 
 def test_simulated_captures_are_seven_tenths_of_the_progress_of_a_report(monkeypatch, tmp_path):
