@@ -1,5 +1,6 @@
 """Values and errors that calibrations write, each from numbers given by hand: sums of squares, quotients, densities."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,12 +8,13 @@ import pytest
 from scipy.stats import norm
 
 from hesim_render.calibrate.aps import output as frames_output
-from hesim_render.calibrate.aps import pairs_output
+from hesim_render.calibrate.aps import pairs_output, pairs_required
 from hesim_render.calibrate.aps.common_mode import Shared
 from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal
 from hesim_render.calibrate.asynchronous import likelihood
 from hesim_render.calibrate.asynchronous import output as trials_output
+from hesim_render.core.errors import SpecError
 
 #: Half of an interval of 95 % of a normal law, errors.
 Z = 1.959964
@@ -329,3 +331,52 @@ def test_beta_and_noise_of_trials_have_errors_of_the_delta_method(law, power):
     fit.free = np.isin(np.arange(len(names)), (of.SHOT, 0))
     assert of._noise(fit, light)["standard_error"] == pytest.approx(sizes[of.SHOT] * slope[of.SHOT], rel=1e-3)
     assert of._beta(fit)[0][4] == 0.0 and of._beta(fit)[1][4] is None
+
+
+ENTRY = SimpleNamespace(error=SpecError)
+
+
+def refused(act, text):
+    """Whether it raises; the error has the text."""
+    try:
+        act()
+    except SpecError as error:
+        assert text in str(error), str(error)
+        return True
+    return False
+
+
+@pytest.mark.parametrize(("part", "is_refused"), [(0.99, False), (1.01, True)])
+def test_captures_are_refused_from_their_limits_on(part, is_refused):
+    """Clipped dark pixels from 1 % on, a well from half of the variance on, tiles 8 % apart, light 2 % off."""
+    pairs = SimpleNamespace(dark=[ENTRY] * 2, spatial_dark=ENTRY, spatial_lit=ENTRY, lit=[ENTRY] * 5)
+    long = SimpleNamespace(temporal=SimpleNamespace(pixel=0.3))
+    dark = SimpleNamespace(low=np.array([0.0, 0.01 * part]))
+    act = partial(pairs_required.require_dark_noise, pairs, dark, long)
+    assert refused(act, "1.01 % of the dark pixels are 0 DN") is is_refused
+    # saturated: as bright as the level of the largest variance, 19 DN², with less than half of it
+    lit = SimpleNamespace(mean=np.array([60.0, 140.0, 190.0]), variance=np.array([6.0, 19.0, 3.0]))
+    long = SimpleNamespace(mean=np.full((4, 6), 141.0), temporal=SimpleNamespace(pixel=9.5 / part))
+    act = partial(pairs_required.require_series_below_well, pairs, long, lit, 1)
+    assert refused(act, "saturated, at 141 DN") is is_refused
+    long = SimpleNamespace(mean=np.full((4, 6), 139.0 + part), temporal=SimpleNamespace(pixel=2.0))
+    assert refused(partial(pairs_required.require_series_below_well, pairs, long, lit, 1), "at 140 DN") is is_refused
+    pairs_required.require_series_below_well(pairs, long, lit, 3)  # no level is saturated
+    # two places of a tile that differ by 8 % of the mean of all four, 5 rows and 7 columns: the last count nowhere
+    high = np.array([[100.0, 100.0], [100.0, 100 + 8.16 * part]])  # 8 % of 102.04
+    signal = np.full((5, 7), 500.0)
+    signal[:4, :6] = np.tile(high, (2, 3))
+    act = partial(pairs_required.require_one_colour, pairs, signal)
+    assert refused(act, "92, 92, 92, 100 %") is is_refused
+    # with a spread of a third of that and more within each place, the pixels have no colour
+    pairs_required.require_one_colour(pairs, signal + np.random.default_rng(1).normal(0, 9.0, signal.shape))
+    curve = SimpleNamespace(at=lambda light: 2.0 * light)
+    light = np.array([1.0, 40.0, 60.0, 80.0, 100.0])
+    off = np.array(
+        [1.4, 1.0, 1 - 0.02 * part, 1.0, 1.5]
+    )  # the first has 2 % of the light at most, the last is not clear
+    off[0] *= 0.99
+    act = partial(
+        pairs_required.require_steady_light, pairs, curve, light, 2 * light * off, np.array([1, 1, 1, 1, 0], bool)
+    )
+    assert refused(act, "this pair is 2 % off") is is_refused
