@@ -152,6 +152,8 @@ def test_jumps_of_a_pulsed_light_are_at_both_ends_of_its_pulses():
     ],
 )
 def test_a_period_has_no_fewer_and_no_more_steps_than_pay(wave, period_us, steps):
-    """Four periods from an instant without a node: mains at least 32, and no more for power below 2 %; 64 between two of a table."""
+    """Four periods from an instant without a node: mains at least 32, and no more for power below 2 % of the mean; at
+    most 64 between two samples of a table.
+    """
     times = wave.follow_us(3.3, 3.3 + 4 * period_us)
     assert times.size == 4 * steps and np.all(np.diff(times) > 0)
