@@ -213,3 +213,31 @@ def test_speed_and_turn_of_a_piece_by_hand(begin_us, end_us, speed, turn):
     first = (0.05 / 2e-3, np.radians(20) / 2e-3)
     back = (0.05 / 4e-3, np.radians(20) / 4e-3)
     assert again == pytest.approx(first if 1000 <= begin_us < 3000 or begin_us >= 7000 else back)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_a_swept_outline_is_as_much_wider_as_its_object_may_stray(flat):
+    """40 × 20 px, 1 cm of stray at 100 px/m and 0.3 px of defocus: 1.3 px on all sides; a line has a box alone."""
+    corners = np.array([[0.1, 0.2, 0], [0.5, 0.2, 0], [0.5, 0.4, 0], [0.1, 0.4, 0]])
+    if flat:
+        corners[:, 1] = 0.2
+    places_ = [(corners[None], 0.002), (corners[None], 0.01)]
+    view = SimpleNamespace(
+        camera_to_world=np.eye(4), defocus_px=lambda scale: 0.3,
+        project_on_sensor=lambda points, rest: (100 * points[..., :2], np.full(points.shape[:2], 100.0)),
+    )  # fmt: skip
+    zoom = SimpleNamespace(
+        _places=lambda *given: places_, _view=view, _along_edges=lambda points: points, _low=np.zeros(2),
+        _high=np.array([200.0, 100.0]), _tuning=SimpleNamespace(small_px=19.9), _aim_px=41,
+    )  # fmt: skip
+    found = Zoom._outline(zoom, 7, None, 0.0, 1.0)
+    np.testing.assert_allclose([found.low, found.high], [[8.7, 18.7], [51.3, 21.3 if flat else 41.3]])
+    assert (len(found.sides) == 0) is flat and found.is_small is flat
+    zoom._aim_px = 39
+    assert found.target == 7 and Zoom._outline(zoom, 7, None, 0.0, 1.0).target is None
+    for beyond in (1.25, 1.35) if not flat else ():
+        for x, y in ((10 - beyond, 30), (50 + beyond, 30), (30, 20 - beyond), (30, 40 + beyond)):
+            assert np.all(found.sides @ [x, y, 1] <= 0) == (beyond < 1.3)
+    for low, high in (([51.4, 0], [200, 100]), ([0, 0], [8.6, 100]), ([0, 41.4], [200, 100]), ([0, 0], [200, 18.6])):
+        zoom._low, zoom._high = np.array(low, float), np.array(high, float)
+        assert Zoom._outline(zoom, 7, None, 0.0, 1.0) is None
