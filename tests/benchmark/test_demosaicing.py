@@ -61,6 +61,7 @@ def test_methods_are_scored_against_it(clip, tmp_path):
     found = evaluate_benchmark(root, tasks=["demosaic"], predictions=tmp_path / "mine")
     values = {score["method"]: score["values"] for score in json.loads(json.dumps(found["scores"]))}
     assert set(values) == {"guided", "bilinear", "prediction"}
+    assert {(score["clip"], score["task"], score["item"]) for score in found["scores"]} == {(clip.name, "demosaic", 0)}
     # rounding of float64 alone separates the prediction from the truth
     assert values["prediction"]["delta_e"] < 1e-3 and values["guided"]["delta_e"] > 0.1
     assert values["guided"]["psnr_db"] > values["bilinear"]["psnr_db"] > 15
