@@ -494,6 +494,11 @@ def test_simulated_captures_are_seven_tenths_of_the_progress_of_a_report(monkeyp
     assert told[-1] == ("event pixels", pytest.approx(0.35))
 
 
+def test_a_share_that_is_the_level_has_reached_it():
+    place, _ = crossing(np.array([1.0, 2.5]), np.array([0.3, 0.9]), np.array([0.02, 0.02]), 0.9, 400)
+    assert place == pytest.approx(2.5)
+
+
 def test_an_s_curve_goes_from_chance_to_one():
     curve = SCurve(9.0, None, None, None, 0.1, {}, 0.3, 0.05, 40)
     np.testing.assert_allclose(curve.at(np.array([-9.0, 0.3, 0.35, 9.0])), [0.1, 0.55, 0.1 + 0.9 * norm.cdf(1), 1])
