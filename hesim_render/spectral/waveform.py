@@ -17,8 +17,8 @@ from hesim_render.core.units import US_PER_S
 
 #: Largest deviation of ln w from straight lines between the times of `follow_us`.
 FOLLOW_TOLERANCE = 0.002
-#: Largest and least number of steps in a period of a smooth waveform; largest number in a segment of a table.
-_MOST_STEPS, _LEAST_STEPS, _MOST_TABLE_STEPS = 512, 32, 64
+#: Least number of steps in a period of a smooth waveform; largest number in a segment of a table.
+_LEAST_STEPS, _MOST_TABLE_STEPS = 32, 64
 #: Power over the mean below which relative changes are ignored.
 _FLOOR = 0.02
 
@@ -104,7 +104,7 @@ class Mains:
         # |d² ln w/dφ²| is largest in the minimum, d/(1 − d); the deviation from a chord over h is h²/8 times that
         curvature = self.depth / max(1 - self.depth, _FLOOR)
         wanted = np.ceil(2 * np.pi * np.sqrt(curvature / (8 * FOLLOW_TOLERANCE)))
-        steps = int(np.clip(wanted, _LEAST_STEPS, _MOST_STEPS))
+        steps = max(int(wanted), _LEAST_STEPS)
         period_us = US_PER_S / (2 * self.frequency_hz)
         return _every_period(np.arange(steps) / steps, period_us, 0.0, begin_us, end_us)
 

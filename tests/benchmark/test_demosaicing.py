@@ -61,6 +61,7 @@ def test_methods_are_scored_against_it(clip, tmp_path):
     found = evaluate_benchmark(root, tasks=["demosaic"], predictions=tmp_path / "mine")
     values = {score["method"]: score["values"] for score in json.loads(json.dumps(found["scores"]))}
     assert set(values) == {"guided", "bilinear", "prediction"}
+    assert {(score["clip"], score["task"], score["item"]) for score in found["scores"]} == {(clip.name, "demosaic", 0)}
     # rounding of float64 alone separates the prediction from the truth
     assert values["prediction"]["delta_e"] < 1e-3 and values["guided"]["delta_e"] > 0.1
     assert values["guided"]["psnr_db"] > values["bilinear"]["psnr_db"] > 15
@@ -102,3 +103,26 @@ def test_bilinear_is_the_mean_of_the_nearest_samples():
     tile = np.array([[0, 0, 1, 1], [0, -1, 1, 1], [1, 1, 2, 2], [1, 1, 2, 2]])
     even = bilinear(np.full((16, 16), 7.0), tile)
     np.testing.assert_allclose(even, 7.0)
+
+
+def test_pictures_are_compared_at_the_brightness_of_the_wanted_one():
+    """Grey whose 99.5 % point goes to 0.95, in the codes of sRGB; its few bright pixels end at 1 in both."""
+    wanted, picture = np.full((40, 30, 3), 0.2, np.float32), np.full((40, 30, 3), 0.12, np.float32)
+    wanted[3, :5], picture[3, :5] = 0.6, 0.3
+    codes = [1.055 * (0.95 * part) ** (1 / 2.4) - 0.055 for part in (1, 0.6)]
+    found = ClipDevelopment._compared(None, picture, wanted)
+    error = (codes[0] - codes[1]) ** 2 * (1 - 5 / 1200)
+    assert found["psnr_db"] == pytest.approx(-10 * np.log10(error), abs=1e-4)
+    lightness = [116 * np.cbrt(0.95 * part) - 16 for part in (1, 0.6)]
+    middle = sum(lightness) / 2
+    weight = 1 + 0.015 * (middle - 50) ** 2 / np.sqrt(20 + (middle - 50) ** 2)
+    assert found["delta_e"] == pytest.approx((lightness[0] - lightness[1]) / weight * (1 - 5 / 1200), rel=1e-3)
+    assert 0 < found["ssim"] < 1
+    narrow = (
+        ClipDevelopment._compared(None, picture[:11], wanted[:11]),
+        ClipDevelopment._compared(None, picture[:10], wanted[:10]),
+    )
+    assert "ssim" in narrow[0] and "ssim" not in narrow[1]
+    black = ClipDevelopment._compared(None, picture, np.zeros_like(wanted))
+    code = 1.055 * np.array([0.12, 0.3]) ** (1 / 2.4) - 0.055
+    assert black["psnr_db"] == pytest.approx(-10 * np.log10(code**2 @ [1195 / 1200, 5 / 1200]), abs=1e-4)

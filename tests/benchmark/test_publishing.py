@@ -10,8 +10,9 @@ from ruamel.yaml import YAML
 import hesim_render as hr
 from benchmarks import small
 from hesim_render.benchmark import build_benchmark, card
-from hesim_render.benchmark.card import card_header, tasks
+from hesim_render.benchmark.card import card_header, spread, tasks
 from hesim_render.benchmark.shards import pack_benchmark
+from hesim_render.benchmark.statistics import FIGURES
 from hesim_render.benchmark.tonic_dataset import EventDataset
 from hesim_render.core.errors import RangeError, SpecError
 
@@ -89,6 +90,14 @@ def test_shards_tell_hubs_the_files_of_each_split(built, tmp_path):
     given = {"clips": [], "name": "n", "spec": {"truth": [], "sharp": None}}
     values = YAML(typ="safe").load(card_header(given, {"val": "val-*.h5"}).split("---\n")[1])
     assert values["configs"][0]["data_files"] == [{"split": "validation", "path": "val-*.h5"}]
+
+
+def test_figures_of_clips_span_decades_of_what_is_above_0():
+    first, second = list(FIGURES)[:2]
+    rates = [{"figures": {first: value, second: 0.0}} for value in (30.0, 0.0, 3000.0, 3.0, 600.0)]
+    found = spread([*rates, {"figures": {}}])
+    assert found[first] == {"min": 0, "median": 30, "max": 3000, "decades": pytest.approx(3), "zero": 1}
+    assert found[second] == {"min": 0, "median": 0, "max": 0, "decades": 0, "zero": 5}
 
 
 def test_sizes_and_tasks_of_other_benchmarks():

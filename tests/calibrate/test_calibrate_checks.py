@@ -157,6 +157,23 @@ def test_groups_of_brightness_hold_enough_pixels_and_events():
     assert np.all(np.diff(group[order]) >= 0)
 
 
+@pytest.mark.parametrize(
+    ("pixels", "events", "each"),
+    [
+        (8000, 0.125, 400),  # a twentieth of 1000 events
+        (16_000, 0.25, 400),  # 100 of 4000 are enough
+        (1600, 2**-5, 320),  # at least 10 of 50
+        (1000, 1.0, 200),  # 50 events of 50 pixels: at least 200 pixels
+    ],
+)
+def test_groups_of_like_pixels_by_hand(pixels, events, each):
+    group = event_goodness._groups(np.arange(pixels)[::-1], np.full(pixels, events))
+    assert np.bincount(group).tolist() == [each] * (pixels // each)
+    # a scatter is that of 100 events: by the hundred of the sum in which a group ends, and the rest joins the last
+    assert event_goodness._wider(np.full(7, 40.0)).tolist() == [0, 0, 1, 1, 1, 1, 1]
+    assert event_goodness._wider(np.full(12, 40.0)).tolist() == [0, 0, 1, 1, 1, 2, 2, 3, 3, 3, 3, 3]
+
+
 @pytest.fixture(scope="module")
 def good_events(tmp_path_factory):
     """Captures of good counts, and their calibration."""

@@ -369,3 +369,17 @@ def test_counts_are_drawn_over_the_fit_of_their_own_polarity(monkeypatch):
     np.testing.assert_allclose(rate[0][COLOURS[0]][1], [[9, 3 / 7_000]])
     low, high = drawn[1].axes[0].get_ylim()
     assert low == pytest.approx(0.8 * 3 / 7_000) and high > 0.99  # the fit and all counts are seen
+
+
+def test_counts_of_both_polarities_are_shaded_by_their_logarithm(monkeypatch):
+    """None is the darkest, the most the brightest; squares lie about their whole counts, equal ones on the line."""
+    counts = np.zeros((12, 12))
+    counts[2, 9], counts[5, 5] = 399.0, 19.0
+    monkeypatch.setattr(event_report, "svg", lambda figure: figure)
+    axes = event_report._on_off("lit", {"figure_on_off_lit": counts, "figure_on_off_lit_top": np.array(11.5)}).axes[0]
+    image, line = axes.images[0], axes.lines[0]
+    np.testing.assert_allclose(image.norm([0.0, 19.0, 399.0]), [0, 0.5, 1])  # 20² is 400
+    assert image.get_extent() == [-0.5, 11.5, -0.5, 11.5] and image.origin == "lower"
+    assert np.array_equal(line.get_xydata(), [[0, 0], [11.5, 11.5]])
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("ON events", "OFF events")
+    assert event_report._on_off("dark", {}) == ""

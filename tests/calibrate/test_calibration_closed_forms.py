@@ -15,6 +15,7 @@ from scipy.stats import norm
 import hesim_render as hr
 from hesim_render.calibrate.aps import checks as frame_checks
 from hesim_render.calibrate.aps import photon_transfer, variance
+from hesim_render.calibrate.aps.common_mode import Shared
 from hesim_render.calibrate.aps.composite import Composite, signal_at_event_pixels
 from hesim_render.calibrate.aps.dark import fit_dark
 from hesim_render.calibrate.aps.photon_transfer import _read_noise, linearity, system_gain
@@ -118,6 +119,76 @@ def test_goodness_of_the_variance_fit(more):
     assert found.expected_chi2 == pytest.approx(expected, rel=1e-6)
     deviation = (found.chi2_per_dof / expected - 1) * np.sqrt((count - 6) / (2 + 12 / (FRAMES - 1)))
     assert found.p_value == pytest.approx(ndtr(-deviation), rel=1e-4)
+
+
+@pytest.mark.parametrize(("chi2", "chance", "seen"), [(2.098, 1e-30, False), (2.102, 1e-30, True), (2.102, 0.5, False)])
+def test_variances_scatter_too_much_from_a_twentieth_on(chi2, chance, seen):
+    """χ² of 2 is expected: 5 % more is 2.1; of four positions the chance of any counts."""
+    good = SimpleNamespace(chi2_per_dof=2.0, expected_chi2=2.0, p_value=0.3)
+    wide = SimpleNamespace(chi2_per_dof=chi2, expected_chi2=2.0, p_value=chance)
+    told = frame_checks._scatter(SimpleNamespace(fits={(0, 0): good, (0, 1): good, (1, 0): wide, (1, 1): good}))
+    assert (told is not None) is seen
+    if told is not None:
+        assert "χ²/dof 2.102 at position (1, 0)" in told.text and told.p_value == pytest.approx(4e-30)
+
+
+def of_frames(cubic=None):
+    """A calibration with a dark variance of 4 − 1/12 DN², and known errors of β0 and β3."""
+    bins = SimpleNamespace(
+        variance_dn2=np.array([4 - 1 / 12, 30.0, 81.0]), lit=np.array([False, True, True]),
+        signal_dn=np.array([0.0, 100.0, 300.0]), exposure_s=np.array([0.01, 0.02, 0.03]),
+    )  # fmt: skip
+    fit = SimpleNamespace(
+        covariance=np.diag([0.0036, 0, 0, 1e-6, 0, 0]), identified=np.array([True] * 6), beta=BETA, cubic=cubic
+    )
+    return SimpleNamespace(bins={(0, 1): bins}, fits={(0, 1): fit}, rows=Shared(0.49, 0.1, 8.0, 1e-9))
+
+
+@pytest.mark.parametrize(("part", "seen"), [(0.99, False), (1.01, True)])
+def test_findings_of_frames_begin_at_their_limits_and_have_their_figures(part, seen):
+    """Each just below and just above the size from which it matters, with its numbers in DN, ms and per cent."""
+    given = of_frames()
+    still = Shared(1e-9, 1e-9, 0.1, 0.5)
+
+    def drift(black, light):
+        return [
+            SimpleNamespace(exposure_us=2500, black=still, black_range_dn=0.0, light=still, light_range=0.0),
+            SimpleNamespace(exposure_us=7500, black=black, black_range_dn=0.71, light=light, light_range=0.034),
+        ]
+
+    # a thousandth of the dark variance, or half of the error of β0, 0.03: the first is less
+    moved = Shared(0.004 * part, 1e-4, 40.0, 3e-5)
+    told = frame_checks._black(given, drift(moved, still), "black level, dark")
+    assert (told is not None) is seen
+    if told is not None:
+        assert f"by {np.sqrt(0.00404):.3g} DN rms (0.71 DN from lowest" in told.text and "frames of 7.5 ms" in told.text
+        assert told.p_value == pytest.approx(6e-5)
+    # a thousandth of the largest variance over the square of the largest signal, 9e-7; half of the error of β3 is 5e-4
+    told = frame_checks._light(given, drift(still, Shared(9e-7 * part, 1e-8, 40.0, 3e-5)))
+    assert (told is not None) is seen
+    if told is not None:
+        rms = 100 * np.sqrt(9.09e-7)
+        assert f"by {rms:.3g} % rms (3.4 % from lowest" in told.text and "frames of 7.5 ms" in told.text
+    assert frame_checks._black(given, drift(Shared(1.0, 1e-4, 40.0, 6e-5), still), "b") is None  # of two exposures
+    # a twentieth of the dark noise, 2 DN; 0.3 % of the signal
+    moved = [frame_checks.Proportion(1500, 0.01, 0.1, -1e-4, 1e-3)]
+    moved.append(frame_checks.Proportion(4500, -0.1 * part, 1e-3, 3e-3 * part, 1e-5))
+    for told, text in (
+        (frame_checks._shift(given, moved), "are -0.101 DN off"), (frame_checks._deviation(moved), "by +0.303 %"),
+    ):  # fmt: skip
+        assert (told is not None) is seen
+        assert told is None or (text in told.text and "at 4.5 ms" in told.text)
+    assert frame_checks._deviation(moved[1:]) is None
+    assert "together by 0.7 DN rms" in frame_checks._rows(given).text
+
+
+def test_a_bend_of_the_variance_is_told_in_parts_of_the_brightest():
+    told = frame_checks._curvature(of_frames(cubic=(-3e-8, 5e-9)))
+    share = -3e-8 * 300**3 / (BETA @ [1, 300, 0.03, 300**2, 300 * 0.03, 0.03**2])
+    assert f"is -3e-08 ± 5e-09 DN⁻¹, {100 * share:+.2g} % of" in told.text
+    assert told.p_value == pytest.approx(2 * norm.sf(6))
+    assert frame_checks._curvature(of_frames(cubic=(-3e-8, 1e-8))) is None  # three errors
+    assert frame_checks._curvature(of_frames()) is None
 
 
 def test_dark_current_is_the_mean_of_good_pixels():
@@ -705,6 +776,17 @@ def test_a_flickering_pixel_has_the_chance_of_the_time_in_which_it_fires():
     assert found.on[5, 7] * found.firing_share[5, 7] == pytest.approx(0.12, rel=0.005) and found.off[5, 7] == 0
     assert 0.9 < found.correlation[5, 7] < 1
     assert np.all(found.on[~bad] == 0) and np.all(found.firing_share[~bad] == 1)
+
+
+def test_a_pixel_that_is_known_in_one_light_alone_is_hot_or_silent():
+    """Nothing tells whether its rate changes: no dark capture, no parts."""
+    static = lone_pixel(9000, 40)
+    static.n_on[2, 3] = static.n_off[2, 3] = 0
+    bad = np.zeros((24, 24), bool)
+    bad[5, 7] = bad[2, 3] = True
+    found = classify_event_defects(static, bad, None)
+    assert found.kind[5, 7] == Defect.HOT and found.kind[2, 3] == Defect.STUCK
+    assert found.on[5, 7] == pytest.approx((9000 - 40) / TRIALS, rel=0.01)
 
 
 def test_without_maps_of_frames_there_is_no_signal_at_event_pixels(tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """Values and errors that calibrations write, each from numbers given by hand: sums of squares, quotients, densities."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,12 +8,13 @@ import pytest
 from scipy.stats import norm
 
 from hesim_render.calibrate.aps import output as frames_output
-from hesim_render.calibrate.aps import pairs_output
+from hesim_render.calibrate.aps import pairs_output, pairs_required
 from hesim_render.calibrate.aps.common_mode import Shared
 from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal
 from hesim_render.calibrate.asynchronous import likelihood
 from hesim_render.calibrate.asynchronous import output as trials_output
+from hesim_render.core.errors import SpecError
 
 #: Half of an interval of 95 % of a normal law, errors.
 Z = 1.959964
@@ -214,6 +216,59 @@ def test_findings_of_emva_captures_begin_at_their_limits():
     assert "light of the long series" not in named(pairs=other)  # beyond the brightest clear level
 
 
+def test_findings_of_emva_captures_have_their_figures_in_their_units():
+    """Each number of each text, from those given: per cent, DN, electrons."""
+    given = calibration()
+    curve = SimpleNamespace(
+        **{**vars(given.curve), "light_rms": 0.0123, "offset": 3.0, "at": lambda x: 0.22 * (x + 2) * 1.013}
+    )
+    line = SimpleNamespace(cycles_per_row=0.125, cycles_per_col=0.25, rms_dn=0.37)
+    spectrum = SimpleNamespace(lines=[line] * 4, correlated=True, correlation=0.045)
+    lag = SimpleNamespace(exposure_s=np.arange(16.0), change=np.full(16, 0.62), variance=np.array([0.213]))
+    black = SimpleNamespace(**{**vars(given.black), "rms": 0.61})
+    mean = np.full((14, 22), 112.0)
+    mean[3, 5] = 0.4
+    lit, dark = (SimpleNamespace(**vars(one)) for one in (given.long_lit, given.long_dark))
+    lit.mean, dark.mean = mean, given.long_dark.mean.copy()
+    dark.mean[1, 2:4] = 255.0
+    once = SimpleNamespace(exposure_s=0.0025)
+    pairs = SimpleNamespace(**{**vars(given.pairs), "is_dark_once": True, "dark": [once], "long": [0, 1, 2]})
+    pairs.spatial_lit = SimpleNamespace(photons=250.0, label="250 photons")
+    texts = {
+        finding.check: finding.text
+        for finding in findings(
+            calibration(curve=curve, noise_spectrum=spectrum, dark=lag, black=black, col=(0.49, 0.03), level_rms=0.0231,
+                        pairs=pairs, long_lit=lit, long_dark=dark, dark_noise_is_rounded_off=True)
+        )
+    }  # fmt: skip
+    more = (mean.mean() - dark.mean.mean()) / (0.22 * 252 * 1.013) - 1
+    noise = (9.4 / (14 * 22) + 0.62 / 14 + 0.49 / 22) / 2
+    for check_, figures in {
+        "linearity": f"the mean bends: {100 * (302 * 1.013 / 303 - 1):+.2g} %",
+        "light offset": "has 3 photons more",
+        "light": "scatters by 1.2 % from",
+        "variance": "scatter by 2.3 % about the polynomial, more than chance (χ²/dof 3.2)",
+        "row noise": f"rows change together from frame to frame by {np.sqrt(0.62):.3f} DN ({np.sqrt(0.62) / K:.1f} e-)",
+        "column noise": f"columns change together from frame to frame by 0.7 DN ({0.7 / K:.1f} e-)",
+        "interference": "0.125 periods a row and 0.25 a column has a new phase in each frame, 0.37 DN rms",
+        "read noise": "a correlation of +0.045",
+        "column pattern": "0.35 DN rms",
+        "black level": f"changes by {np.sqrt(0.61**2 - noise):.2g} DN",
+        "image lag": "is 0.62 DN brighter",
+        "light of the long series": f"has {100 * more:.2g} % more light",
+        "stuck pixels": "2 pixels are at full scale in the dark, 1 at 0 DN",
+        "dark noise": "down to 0.213 DN²",
+        "dark frames": "one exposure, 2500 µs",
+        "long series": "of 3 long series in the light, that of 250 photons",
+    }.items():
+        assert figures in texts[check_], texts[check_]
+    below = findings(calibration(long_lit=SimpleNamespace(**{**vars(given.long_lit), "mean": np.full((14, 22), 90.0)})))
+    less = 100 * (1 - 50 / (0.22 * 252 * 1.0021))
+    assert (
+        f"has {less:.2g} % less light" in {finding.check: finding.text for finding in below}["light of the long series"]
+    )
+
+
 def test_histograms_of_noise_are_densities_beside_that_of_their_law():
     """20,000 values about the mean of 5 frames; their law is normal with the polynomial's variance, 1/12 and rows."""
     rng = np.random.default_rng(6)
@@ -276,3 +331,52 @@ def test_beta_and_noise_of_trials_have_errors_of_the_delta_method(law, power):
     fit.free = np.isin(np.arange(len(names)), (of.SHOT, 0))
     assert of._noise(fit, light)["standard_error"] == pytest.approx(sizes[of.SHOT] * slope[of.SHOT], rel=1e-3)
     assert of._beta(fit)[0][4] == 0.0 and of._beta(fit)[1][4] is None
+
+
+ENTRY = SimpleNamespace(error=SpecError)
+
+
+def refused(act, text):
+    """Whether it raises; the error has the text."""
+    try:
+        act()
+    except SpecError as error:
+        assert text in str(error), str(error)
+        return True
+    return False
+
+
+@pytest.mark.parametrize(("part", "is_refused"), [(0.99, False), (1.01, True)])
+def test_captures_are_refused_from_their_limits_on(part, is_refused):
+    """Clipped dark pixels from 1 % on, a well from half of the variance on, tiles 8 % apart, light 2 % off."""
+    pairs = SimpleNamespace(dark=[ENTRY] * 2, spatial_dark=ENTRY, spatial_lit=ENTRY, lit=[ENTRY] * 5)
+    long = SimpleNamespace(temporal=SimpleNamespace(pixel=0.3))
+    dark = SimpleNamespace(low=np.array([0.0, 0.01 * part]))
+    act = partial(pairs_required.require_dark_noise, pairs, dark, long)
+    assert refused(act, "1.01 % of the dark pixels are 0 DN") is is_refused
+    # saturated: as bright as the level of the largest variance, 19 DN², with less than half of it
+    lit = SimpleNamespace(mean=np.array([60.0, 140.0, 190.0]), variance=np.array([6.0, 19.0, 3.0]))
+    long = SimpleNamespace(mean=np.full((4, 6), 141.0), temporal=SimpleNamespace(pixel=9.5 / part))
+    act = partial(pairs_required.require_series_below_well, pairs, long, lit, 1)
+    assert refused(act, "saturated, at 141 DN") is is_refused
+    long = SimpleNamespace(mean=np.full((4, 6), 139.0 + part), temporal=SimpleNamespace(pixel=2.0))
+    assert refused(partial(pairs_required.require_series_below_well, pairs, long, lit, 1), "at 140 DN") is is_refused
+    pairs_required.require_series_below_well(pairs, long, lit, 3)  # no level is saturated
+    # two places of a tile that differ by 8 % of the mean of all four, 5 rows and 7 columns: the last count nowhere
+    high = np.array([[100.0, 100.0], [100.0, 100 + 8.16 * part]])  # 8 % of 102.04
+    signal = np.full((5, 7), 500.0)
+    signal[:4, :6] = np.tile(high, (2, 3))
+    act = partial(pairs_required.require_one_colour, pairs, signal)
+    assert refused(act, "92, 92, 92, 100 %") is is_refused
+    # with a spread of a third of that and more within each place, the pixels have no colour
+    pairs_required.require_one_colour(pairs, signal + np.random.default_rng(1).normal(0, 9.0, signal.shape))
+    curve = SimpleNamespace(at=lambda light: 2.0 * light)
+    light = np.array([1.0, 40.0, 60.0, 80.0, 100.0])
+    off = np.array(
+        [1.4, 1.0, 1 - 0.02 * part, 1.0, 1.5]
+    )  # the first has 2 % of the light at most, the last is not clear
+    off[0] *= 0.99
+    act = partial(
+        pairs_required.require_steady_light, pairs, curve, light, 2 * light * off, np.array([1, 1, 1, 1, 0], bool)
+    )
+    assert refused(act, "this pair is 2 % off") is is_refused

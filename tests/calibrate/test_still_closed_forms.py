@@ -341,6 +341,20 @@ def test_a_target_whose_cycles_do_not_show_tells_no_thresholds():
     assert f"{2 * target.GROUPS} are needed" in target.thresholds(tally, 2.0, 5.0).ratio["reason"]
 
 
+@pytest.mark.parametrize(("hz", "events", "enough"), [(1.0, 4.5, True), (0.99, 4.5, False), (1.0, 4.4, False)])
+def test_three_cycles_of_one_and_a_half_events_are_enough(hz, events, enough, monkeypatch):
+    monkeypatch.setattr(target, "_course", lambda *given: course())
+    count = events + np.tile([-1.0, 1.0], (2, 2 * target.GROUPS))
+    tally = SimpleNamespace(
+        per_pixel=lambda: count,
+        seconds=3.0,
+        group=np.arange(count.shape[1]) // 4,
+        used=np.ones(count.shape[1], np.bool_),
+    )
+    told = target.thresholds(tally, 2.0, hz)
+    assert ("3 cycles of 1.5 events are needed" in str(told)) is not enough
+
+
 def test_leaks_are_those_of_all_pixels_with_jackknife_errors():
     """The first column is of all groups, the others leave one out; the unknown part is a square beside them."""
     rng = np.random.default_rng(4)

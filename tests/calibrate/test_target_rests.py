@@ -2,11 +2,13 @@
 light: against noise written in NumPy, on six sensors and a hundred more (`tests/support/still_pixels.py`).
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from hesim_render.calibrate.recordings import rests, target
-from hesim_render.calibrate.recordings.tally import tally
+from hesim_render.calibrate.recordings.tally import GROUPS, STEPS, tally
 from hesim_render.exchange import EventStream
 from tests.support.still_pixels import noisy_target_events
 
@@ -129,6 +131,46 @@ def test_rests_that_differ_from_pixel_to_pixel_are_not_used():
     assert rests.rests(tally(EventStream.of(both, (SIDE, SIDE))), 0.0, 1.0) is None
     turns = noisy_target_events(rng, theta, theta, 2.0, hz=3.0, rests=(0.0, 0.0), **keys)
     assert rests.rests(tally(EventStream.of(turns, (SIDE // 2, SIDE))), 0.0, 1.0) is None
+
+
+def histogram(*counts):
+    """Counts at times in µs, in steps of a 32nd of an octave."""
+    result = np.zeros(STEPS)
+    for us, count in counts:
+        result[int(np.log2(us) * 32)] += count
+    return result
+
+
+def tally_of(late, uneven=0.0):
+    """Intervals of some 5 and 4 ms, and gaps of some 230 ms of all groups; `late` events in each factor of two."""
+    share = 1 + uneven * np.linspace(-1, 1, GROUPS)
+    times = (174_000, 138_000, 70_000)  # before the first event of the fall, which comes 4 ms after the rest
+    gaps = np.array([histogram((230_000, 4000), *zip(times, part * np.array(late), strict=True)) for part in share])
+    same = [[histogram((us, 90))] * GROUPS for us in (5000, 4000)]
+    return SimpleNamespace(gaps=np.array([gaps, gaps]), same=np.array(same), period_s=lambda: 0.7)
+
+
+@pytest.mark.parametrize(("last", "uneven", "noisy"), [(30, 0.0, False), (47, 0.1, False), (49, 0.6, True)])
+def test_rests_by_hand(last, uneven, noisy):
+    """Rests of 222 ms: four factors of two would begin below four intervals, so that there are three."""
+    late = np.array([20.0, 30.0, last])
+    both = rests.rests(tally_of(late, uneven), 0.0, 1.25)
+    up, down = (2 ** ((int(np.log2(us) * 32) + 0.5) / 32) * 1e-6 for us in (5000, 4000))
+    whole = GROUPS * (4000 + late.sum())
+    # the median lies within the step of the gaps, late events come before
+    step = int(np.log2(230_000) * 32) + (0.5 * whole - GROUPS * late.sum()) / (4000 * GROUPS)
+    middle = 2 ** (step / 32) * 1e-6
+    counts = late.sum() * (1 + uneven * np.linspace(-1, 1, GROUPS))
+    for rest, (first, second), own in zip(both, ((up, down), (down, up)), (1.25, 0.8), strict=True):
+        length = middle - 0.5 * first - (0.5 / own + 1) * second
+        assert rest.ramps.rest_s == pytest.approx(length) and rest.ramps.drift == 0
+        assert rest.ramps.slopes == pytest.approx((1 / first, own / second))
+        assert rest.edges_s == pytest.approx(length / np.array([8, 4, 2, 1]), abs=2.3e-3)  # steps of 2 %
+        assert rest.late == pytest.approx(GROUPS * late) and rest.of == pytest.approx(whole)
+        assert rest.scatter == pytest.approx(max(counts.var(ddof=1) / counts.mean(), 1.0))
+        assert rest.is_noisy is noisy  # 1.4 · 30 · 20 and 3 √(20 · (30 + 48)) are 48 a group
+    leaking = rests.rests(tally_of(late), 0.5, 1.25)
+    assert [rest.ramps.drift for rest in leaking] == pytest.approx([0.5, -0.4])
 
 
 @pytest.mark.slow

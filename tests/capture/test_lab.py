@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import zipfile
 from types import SimpleNamespace
 
 import numpy as np
@@ -271,6 +272,8 @@ def test_npz_pieces_are_read_by_numpy(tmp_path):
     np.testing.assert_array_equal(found["whole"], values)
     np.testing.assert_array_equal(found["pieces"], values)
     assert found["number"] == 7 and found["pieces"].dtype == np.uint16
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:  # the first date that ZIP can state, whatever the clock says
+        assert {member.date_time for member in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
     for rows in (5, 3):  # too few pieces, and too many
         with pytest.raises(RangeError, match="values of x"), NpzWriter(tmp_path / "b.npz") as archive:
             archive.add_pieces("x", (rows, 3, 2), np.uint16, iter(values))

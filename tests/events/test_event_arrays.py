@@ -135,6 +135,7 @@ def test_events_of_a_recording_fit_its_grid():
         (lambda: voxel_grid(EVENTS, SHAPE, 5, 100, 50), "from the begin on"),
         (lambda: voxel_grid(EVENTS["t_us"], SHAPE), "t_us, x, y, polarity"),
         (lambda: event_rate(EVENTS, -1), "above 0"),
+        (lambda: event_rate(EVENTS, 1, 0, 10_000_001), "at most 10000000 intervals"),
     ],
 )
 def test_mistakes_are_named(act, text):

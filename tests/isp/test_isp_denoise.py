@@ -60,6 +60,13 @@ def test_the_transform_evens_the_noise_and_comes_back_without_bias(a, b, c, leve
             assert stable.var() == pytest.approx(1, abs=0.08), level
 
 
+def test_a_variance_is_a_thousandth_of_that_in_the_dark_at_least():
+    """4 + 0.4 I − 0.05 I² ends at 13.8 DN; below 0 the noise is that of the dark."""
+    transform = Stabiliser(4.0, 0.4, -0.05, 100.0)
+    found = transform.sigma([-3.0, 0.0, 5.0, 13.0, 20.0, 100.0]) ** 2
+    np.testing.assert_allclose(found, [4.0, 4.0, 4.75, 0.75, 4e-3, 4e-3])
+
+
 def test_the_transform_is_monotonic_and_its_own_inverse_at_high_light():
     transform = Stabiliser(0.72, 0.16, 0.0, 959.0)
     signal = np.linspace(-5, 959, 4001, dtype=np.float32)[None]

@@ -14,7 +14,7 @@ from PIL import Image
 import hesim_render as hr
 from hesim_render.core.errors import HesimWarning, SpecError
 from hesim_render.recording import camera_raw
-from hesim_render.recording.dng import noise_profile, write_dng
+from hesim_render.recording.dng import is_packed, noise_profile, write_dng
 from hesim_render.recording.imports import import_recording
 from hesim_render.recording.outline import scene_name
 from hesim_render.recording.showcase import needs_preview, write_preview_dng
@@ -178,3 +178,9 @@ def test_directories_of_exposures_begin_at_even_places(tmp_path):
         assert begin % 2 == 0
         lengths.append(path.stat().st_size - begin)
     assert len(set(lengths)) == 1
+
+
+def test_what_is_no_tiff_file_is_named_before_it_is_imported(tmp_path):
+    (tmp_path / "a.dng").write_text("words")
+    with pytest.raises(SpecError, match=r"a\.dng: cannot be read as a DNG file \("):
+        is_packed(tmp_path / "a.dng")

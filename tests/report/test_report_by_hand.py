@@ -10,7 +10,7 @@ from scipy import special
 from scipy.stats import norm
 
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, run, s_curves, simulate
+from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, run, s_curves, simulate, texts
 from hesim_render.report.bench import EventBench
 from hesim_render.report.definitions import FRAMES
 from hesim_render.report.estimates import crossing, log_estimated, mean_error, quantile, whole_us_quantile
@@ -268,6 +268,30 @@ def test_intervals_are_drawn_as_a_density():
     assert edges[0] == 1 and edges[-1] < 3000 and axes.lines[0].get_xdata()[0] == 130.0
 
 
+def test_each_page_of_the_pdf_is_a4_and_has_its_number_in_the_lower_margin():
+    """Right-aligned with the text, in the middle of the margin; a thin line below each row of a table."""
+    made, pages = pdf.Document(io.BytesIO(), "t"), []
+    made._pages = SimpleNamespace(savefig=pages.append, close=lambda: None)
+    for k in range(90):
+        made.text(f"line {k}")
+    made.table(SimpleNamespace(title="A table", head=("name",), rows=[("a",), ("b",)], widths=(1.0,)))
+    made.close()
+    assert len(pages) == 2
+    for number, page in enumerate(pages, 1):
+        assert page.get_size_inches() * 25.4 == pytest.approx((210, 297), abs=0.1)
+        mark = next(text for text in page.texts if text.get_text() == str(number))
+        assert mark.get_ha() == "right" and 6 <= mark.get_fontsize() <= 8
+        assert np.array(mark.get_position()) * (595, 842) == pytest.approx((595 - 42, 21))
+        assert [text for text in page.texts if text.get_text().startswith(("line", "name"))]
+    for line in pages[1].artists:
+        assert np.array(line.get_xdata()) * 595 == pytest.approx([42, 595 - 42]) and line.get_linewidth() < 0.5
+    lows = [842 * line.get_ydata()[0] for line in pages[1].artists]
+    tops = {text.get_text(): 842 * text.get_position()[1] for text in pages[1].texts}
+    # each line lies between the foot of its row, 6.3 · 1.32 below its top, and the next row
+    for low, above, below in zip(lows, ("name", "a", "b"), ("a", "b", None), strict=True):
+        assert low <= tops[above] - 6.3 * 1.32 and (below is None or low > tops[below])
+
+
 def test_pages_of_the_pdf_hold_their_lines(monkeypatch):
     """No line over the margins of 42 pt or over another one; a table that goes on has its head on each page."""
     lines = []
@@ -411,6 +435,68 @@ def test_chance_is_the_share_of_windows_of_still_light_with_an_event():
     good[0] = False
     assert limits.false_share(bench, steady, 100, 0, good) == pytest.approx(3 / 12)
     assert np.isnan(limits.false_share(bench, steady, 341, 0, good))
+
+
+def test_tables_against_light_have_the_figures_of_each_light_and_temperature():
+    """Values with three digits and their intervals, shares in per cent with 1.96 errors, upper limits, gaps."""
+
+    def entry(value):
+        return {"value": value, "interval_95": [0.9 * value, 1.2 * value], "unit": "µs"}
+
+    def steady(lux, celsius, on):
+        return SimpleNamespace(lux=lux, temperature_c=celsius, rates=[entry(on), {"value": 0.0, "upper_limit": 0.0123}])
+
+    def answer(lux, celsius, latency):
+        jitter = {"value": None, "reason": "too few"}
+        return SimpleNamespace(lux=lux, temperature_c=celsius, contrast=0.4567, latency=entry(latency), jitter=jitter)
+
+    found = SimpleNamespace(lux=np.array([5.0, 80.0]), share=np.array([0.1234, 0.987]), error=np.array([0.02, 0.0031]))
+    measured = SimpleNamespace(
+        latencies=([answer(80.0, 25.0, 1234.5), answer(5.0, 25.0, 23456.0)], [answer(5.0, 40.0, 7.0)]),
+        backgrounds=[steady(5.0, 40.0, 3.21987), steady(5.0, 25.0, 0.5)], ranges=[found, None],
+        entries=[
+            SimpleNamespace(
+                key=key, name="", value=value, lux=lux, contrast=contrast, temperature_c=celsius, pixels=count
+            )
+            for key, value, lux, contrast, celsius, count in (
+                ("dead_time", entry(0.71236), None, None, 31.5, 7), ("hot", entry(3.0), None, None, None, 5),
+                ("latency", {"value": None, "reason": "no jumps"}, None, 0.3456, None, 11),
+                ("latency", entry(5.0), 3.0, None, None, 1), ("jitter", entry(5.0), None, None, None, 1),
+            )
+        ],
+    )  # fmt: skip
+    figures_, light, definitions = texts.event_tables(measured)
+    assert [row[1:] for row in figures_.rows] == [
+        ("0.7124", "0.6411 to 0.8548", "µs", "31.5 °C", "7"),
+        ("3", "2.7 to 3.6", "µs", "steady, all", "5"),
+        ("–", "", "no jumps", "steps of 34.6 %", "11"),
+    ]
+    assert light.title == "Against light (latency of steps of 45.7 %)" and len(light.head) == len(light.widths) == 9
+    assert light.rows == [
+        ("5, 25 °C", "0.5 (0.45 to 0.6)", "< 0.0123", "23500 (21100 to 28100)", "–", "", "", "12.3 ± 3.9", ""),
+        ("80, 25 °C", "", "", "1230 (1110 to 1480)", "–", "", "", "98.7 ± 0.61", ""),
+        ("5, 40 °C", "3.22 (2.9 to 3.86)", "< 0.0123", "", "", "7 (6.3 to 8.4)", "–", "12.3 ± 3.9", ""),
+    ]
+    for table in (figures_, light, definitions):
+        assert sum(table.widths) == pytest.approx(1) and {len(row) for row in table.rows} == {len(table.head)}
+
+
+def test_simulated_captures_are_seven_tenths_of_the_progress_of_a_report(monkeypatch, tmp_path):
+    told = []
+
+    def simulated(sensor, events, frames, size, seed, progress):
+        progress("event pixels", 0.5)
+        raise SpecError("enough")
+
+    monkeypatch.setattr(simulate, "simulate_captures", simulated)
+    with pytest.raises(SpecError, match="enough"):
+        run.make_report(["gen2"], tmp_path / "r", progress=lambda what, part: told.append((what, part)))
+    assert told[-1] == ("event pixels", pytest.approx(0.35))
+
+
+def test_a_share_that_is_the_level_has_reached_it():
+    place, _ = crossing(np.array([1.0, 2.5]), np.array([0.3, 0.9]), np.array([0.02, 0.02]), 0.9, 400)
+    assert place == pytest.approx(2.5)
 
 
 def test_an_s_curve_goes_from_chance_to_one():
@@ -591,19 +677,19 @@ def test_a_report_has_each_table_once_and_a_page_for_each_kind_of_pixels(kinds, 
 @pytest.mark.parametrize("has_photons", (True, False))
 def test_figures_of_frames_have_the_light_they_were_measured_in(has_photons):
     """Levels of 10 to 100 % of saturation, of which the last is not clear; a long series at half of it."""
-    light = np.linspace(100.0, 1000.0, 10) * (1.0 if has_photons else 1e-6)
+    light = np.linspace(12.3456, 123.456, 10) * (1.0 if has_photons else 1e-6)
     result = SimpleNamespace(
         light=light, signal=np.linspace(20.0, 200.0, 10), top_dn=200.0, clear=np.arange(10) < 9,
         pairs=SimpleNamespace(
             has_photons=has_photons,
-            spatial_lit=SimpleNamespace(photons=500.0 if has_photons else None, exposure_s=5e-4),
+            spatial_lit=SimpleNamespace(photons=61.728 if has_photons else None, exposure_s=6.1728e-5),
         ),
     )  # fmt: skip
     lights = emva.FrameFigures(result, {}, []).lights
     assert set(lights) == set(FRAMES)
     if has_photons:
-        assert lights["K"] == "100 to 700 photons" and lights["full_well_e"] == "up to 1000 photons"
-        assert lights["prnu_percent"] == "500 photons, and dark" and lights["dsnu_e"] == "dark"
-        assert lights["linearity_error_percent"] == "100 to 900 photons"
+        assert lights["K"] == "12.3 to 86.4 photons" and lights["full_well_e"] == "up to 123 photons"
+        assert lights["prnu_percent"] == "61.7 photons, and dark" and lights["dsnu_e"] == "dark"
+        assert lights["linearity_error_percent"] == "12.3 to 111 photons"
     else:
-        assert lights["K"] == "0.1 to 0.7 ms" and lights["prnu_percent"] == "0.5 ms, and dark"
+        assert lights["K"] == "0.0123 to 0.0864 ms" and lights["prnu_percent"] == "0.0617 ms, and dark"

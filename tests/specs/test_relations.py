@@ -16,7 +16,7 @@ from hesim_render.specs.geometry import Region
 from hesim_render.specs.lens import IlluminationTable, MeasuredPsf
 from hesim_render.specs.light import LightSpec, TableWaveformSpec
 from hesim_render.specs.mitsuba_scene import MitsubaSpec
-from hesim_render.specs.motion import KeyframeSpec, TrackSpec
+from hesim_render.specs.motion import DeformationSpec, KeyframeSpec, TrackSpec
 from hesim_render.specs.scene import CameraSpec, ObjectSpec
 from hesim_render.specs.study import SurfacesSpec
 from hesim_render.specs.sweep import RangeSpec
@@ -162,3 +162,11 @@ def test_keys_of_a_sensor(name, right, wrong, message):
     read_sensor(name, right)
     with pytest.raises(SpecError, match=message):
         read_sensor(name, right | wrong)
+
+
+def test_a_deforming_mesh_has_all_meshes_of_its_folder_in_the_order_of_their_names(tmp_path):
+    (tmp_path / "shapes").mkdir()
+    for name in ("c.ply", "a.obj", "d.OBJ", "b.PLY", "notes.txt", "e.stl"):
+        (tmp_path / "shapes" / name).touch()
+    spec = DeformationSpec.model_validate({"file": "shapes", "every_us": 1000}, context={"folder": tmp_path})
+    assert spec.files == ["shapes/a.obj", "shapes/b.PLY", "shapes/c.ply", "shapes/d.OBJ"]

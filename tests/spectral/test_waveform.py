@@ -141,3 +141,19 @@ def test_what_is_constant_has_no_times_and_the_highest_power_is_that_of_the_peak
 def test_jumps_of_a_pulsed_light_are_at_both_ends_of_its_pulses():
     """4 kHz, on for a tenth of 250 µs, 90° ahead: switched on at −62.5 µs and every 250 µs from there."""
     np.testing.assert_allclose(Pwm(4000, 0.1, 90.0).jumps_us(100, 700), [187.5, 212.5, 437.5, 462.5, 687.5])
+
+
+@pytest.mark.parametrize(
+    ("wave", "period_us", "steps"),
+    [
+        (Mains(50, 0.01, 10), 10_000, 32),
+        (Mains(40, 0.999, 10), 12_500, 352),
+        (TableWaveform((0.0, 700.0, 1000.0), (1e-5, 3.0, 3.0), repeat=True), 1000, 64 + 1),
+    ],
+)
+def test_a_period_has_no_fewer_and_no_more_steps_than_pay(wave, period_us, steps):
+    """Four periods from an instant without a node: mains at least 32, and no more for power below 2 % of the mean; at
+    most 64 between two samples of a table.
+    """
+    times = wave.follow_us(3.3, 3.3 + 4 * period_us)
+    assert times.size == 4 * steps and np.all(np.diff(times) > 0)

@@ -170,3 +170,16 @@ def test_colours_of_noisy_frames_are_those_of_the_matrix_to_xyz():
     samples = SimpleNamespace(xyz=xyz, white_xyz=white)
     found = chart_noise.measured_figures(np.concatenate([patches, grey], axis=1), rgb_matrix, xyz_matrix, samples)
     assert found["delta_e_noisy"].value < 1e-6 < found["noise_amplification"].value
+
+
+def test_charts_that_do_not_fill_their_rows_show_every_patch():
+    """Five patches on 3 × 2 places, without noise to speak of: each has its own electrons."""
+    sensor = hr.load_sensor("reference-bayer", {"aps.dark_current_e_per_s": 700.0})
+    filters = ["red", "green", "blue"]
+    patch_e = 300.0 * np.arange(1, 6)[:, None] * np.array([1.0, 1.5, 0.7])
+    order = [sensor.layout.filters.index(name) for name in filters]
+    told = np.empty_like(patch_e)
+    told[:, order] = patch_e
+    chart = chart_noise.noisy_chart(sensor, filters, told, 20_000, repeats=3, patch_px=23)
+    assert chart.channels.shape == (3, 5, 144, 3) and chart.tile_px == 4
+    np.testing.assert_allclose(chart.channels.mean(axis=(0, 2)), patch_e, atol=10)

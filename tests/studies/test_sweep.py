@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from skimage.metrics import peak_signal_noise_ratio
 
 import hesim_render as hr
@@ -240,6 +241,25 @@ def test_bad_sweeps_are_one_clear_line(tmp_path, changes, message):
     with pytest.raises(SpecError, match=message) as caught:
         sweep({**BASE, **changes}, out=tmp_path / "out")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "runs"),
+    [
+        ({"scenes": ["a"], "sensors": ["b"]}, 50_000 * 2),
+        ({"scenes": ["a", "b", "c"], "sensors": ["d", "e"]}, 50_000 * 2 * 6),
+        ({"study": "s"}, 50_000 * 2),
+    ],
+)
+def test_the_runs_of_a_sweep_are_counted(changes, runs):
+    """Two seeds of 50,000 pairs of values; a study has no scenes. 100,000 are accepted."""
+    vary = {"x.y": {"first": 1, "last": 2, "count": 10_000}, "x.z": [1, 2, 3, 4, 5]}
+    content = {"schema_version": 1, "name": "n", "seeds": [1, 2], "vary": vary, **changes}
+    if runs == 100_000:
+        SweepSpec.model_validate(content)
+        content["seeds"], runs = [1, 2, 3], 150_000
+    with pytest.raises(ValidationError, match=f"makes {runs} runs, more than 100000"):
+        SweepSpec.model_validate(content)
 
 
 def test_other_folders_and_damaged_runs_are_refused(tmp_path):

@@ -51,6 +51,22 @@ def test_radii_of_an_airy_pattern_rise():
         np.testing.assert_allclose(np.interp(part, np.arange(1 << 14) / (1 << 14), airy_radii()), ring, rtol=1e-4)
 
 
+@pytest.mark.parametrize("name", ["Gaussian", "Airy"])
+def test_even_numbers_go_once_around_the_chief_ray(name):
+    """What is even in the unit square stays so: 40 turns a fortieth apart, and Box and Muller's radius."""
+    types = jit()
+    parts = (np.arange(40) + 0.5) / 40
+    numbers = types.Float(np.full(40, 0.3, np.float32)), types.Float(parts.astype(np.float32))
+    if name == "Airy":
+        x, y = AiryBlur(rendering.mono(lens__diffraction=True)).offset(numbers, types.Float(500.0))
+    else:
+        x, y = GaussianBlur(rendering.mono(lens__psf_fwhm_um=7.3)).offset(numbers, None)
+        radius = 7.3 / np.sqrt(8 * np.log(2)) / 5.0 * np.sqrt(-2 * np.log(0.7))
+        np.testing.assert_allclose(np.hypot(x, y), radius, rtol=1e-5)
+    turns = np.mod(np.arctan2(y, x) / (2 * np.pi), 1)
+    np.testing.assert_allclose(turns, parts, atol=1e-5)
+
+
 @pytest.mark.parametrize(("height_mm", "fwhm_um"), [(0.0, 4.0), (0.5, 7.0), (1.0, 10.0), (3.0, 10.0)])
 def test_a_gaussian_follows_the_image_height(height_mm, fwhm_um):
     told = {"type": "gaussian", "image_height_mm": [0, 1.0], "fwhm_um": [4, 10]}

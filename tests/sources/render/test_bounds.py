@@ -10,7 +10,13 @@ from hesim_render.sources.render.change_driven.neighbours import turns
 from hesim_render.sources.render.change_driven.small_objects import Zoom
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.timeline import Timeline
-from hesim_render.sources.render.transport.motion_bounds import fastest_m_per_s, places, places_seen, stays_in
+from hesim_render.sources.render.transport.motion_bounds import (
+    _speed_and_turn,
+    fastest_m_per_s,
+    places,
+    places_seen,
+    stays_in,
+)
 from hesim_render.sources.render.truth.boxes import _outline
 from hesim_render.specs.motion import TrackSpec
 
@@ -182,3 +188,56 @@ def test_pairs_know_how_many_windows_of_their_row_come_first():
     row, window = np.array([4, 2, 4, 2, 2, 4, 4]), np.array([9, 5, 3, 1, 7, 9, 30])
     assert turns(row, window).tolist() == [1, 1, 0, 0, 2, 1, 2]
     assert turns(row[:0], window[:0]).size == 0
+
+
+@pytest.mark.parametrize(
+    ("begin_us", "end_us", "speed", "turn"),
+    [
+        (600, 900, 0, 0),  # held before the first keyframe
+        (1000, 1300, 0.05 / 2e-3, np.radians(20) / 2e-3),
+        (3000, 5000, 0.12 / 4e-3, np.radians(30) / 4e-3),
+        (6600, 7000, 0.12 / 4e-3, np.radians(30) / 4e-3),
+        (7000, 7400, 0, 0),
+    ],
+)
+def test_speed_and_turn_of_a_piece_by_hand(begin_us, end_us, speed, turn):
+    """5 cm and 20° in 2 ms, 12 cm and 30° in 4 ms; the same again where the track repeats, 6 ms later."""
+    keys = [
+        {"t_us": 1000},
+        {"t_us": 3000, "translation_m": [0.03, 0.04, 0], "rotation_axis": [0, 0, 1], "rotation_deg": 20},
+        {"t_us": 7000, "translation_m": [0.03, 0.04, 0.12], "rotation_axis": [0, 0, 1], "rotation_deg": -10},
+    ]  # fmt: skip
+    assert _speed_and_turn(track(*keys), begin_us, end_us) == pytest.approx((speed, turn))
+    keys[-1] = {"t_us": 7000}
+    again = _speed_and_turn(track(*keys, repeat=True), begin_us + 6000, end_us + 6000)
+    first = (0.05 / 2e-3, np.radians(20) / 2e-3)
+    back = (0.05 / 4e-3, np.radians(20) / 4e-3)
+    assert again == pytest.approx(first if 1000 <= begin_us < 3000 or begin_us >= 7000 else back)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_a_swept_outline_is_as_much_wider_as_its_object_may_stray(flat):
+    """40 × 20 px, 1 cm of stray at 100 px/m and 0.3 px of defocus: 1.3 px on all sides; a line has a box alone."""
+    corners = np.array([[0.1, 0.2, 0], [0.5, 0.2, 0], [0.5, 0.4, 0], [0.1, 0.4, 0]])
+    if flat:
+        corners[:, 1] = 0.2
+    places_ = [(corners[None], 0.002), (corners[None], 0.01)]
+    view = SimpleNamespace(
+        camera_to_world=np.eye(4), defocus_px=lambda scale: 0.3,
+        project_on_sensor=lambda points, rest: (100 * points[..., :2], np.full(points.shape[:2], 100.0)),
+    )  # fmt: skip
+    zoom = SimpleNamespace(
+        _places=lambda *given: places_, _view=view, _along_edges=lambda points: points, _low=np.zeros(2),
+        _high=np.array([200.0, 100.0]), _tuning=SimpleNamespace(small_px=19.9), _aim_px=41,
+    )  # fmt: skip
+    found = Zoom._outline(zoom, 7, None, 0.0, 1.0)
+    np.testing.assert_allclose([found.low, found.high], [[8.7, 18.7], [51.3, 21.3 if flat else 41.3]])
+    assert (len(found.sides) == 0) is flat and found.is_small is flat
+    zoom._aim_px = 39
+    assert found.target == 7 and Zoom._outline(zoom, 7, None, 0.0, 1.0).target is None
+    for beyond in (1.25, 1.35) if not flat else ():
+        for x, y in ((10 - beyond, 30), (50 + beyond, 30), (30, 20 - beyond), (30, 40 + beyond)):
+            assert np.all(found.sides @ [x, y, 1] <= 0) == (beyond < 1.3)
+    for low, high in (([51.4, 0], [200, 100]), ([0, 0], [8.6, 100]), ([0, 41.4], [200, 100]), ([0, 0], [200, 18.6])):
+        zoom._low, zoom._high = np.array(low, float), np.array(high, float)
+        assert Zoom._outline(zoom, 7, None, 0.0, 1.0) is None

@@ -11,6 +11,7 @@ import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven import pilot as pilots
+from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.change_detector import FirstLook, windows_with_changes
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.neighbours import Sites
@@ -172,6 +173,22 @@ def test_ticks_of_lone_pixels_keep_their_flux_with_a_detector(monkeypatch):
     unit = source.noise_unit(source.sensor.layout.evs_pixel.ravel(), every.mean(axis=1), True)
     assert np.mean(every != some) < 0.1
     assert np.sqrt(np.mean(((every - some).mean(axis=1) / unit) ** 2)) < 0.05
+
+
+def test_rays_of_constant_pixels_count_as_those_of_pilots():
+    """28 before, 40 more of this band: manifest and estimate have the sum."""
+    tracer = SimpleNamespace(rays_done=1000)
+
+    def traced(index, window, windows, rays, width_px, near_us):
+        assert (rays, width_px, near_us) == (8, 1.5, (3.0, 9.0)) and window.tolist() == [0] * 5
+        tracer.rays_done += rays * index.size
+        return None, None
+
+    tracer.pilot_rays = traced
+    own = SimpleNamespace(tracer=tracer, counts=SimpleNamespace(pilot_rays=28), _footprint_px=lambda band: 1.5)
+    band = SimpleNamespace(sites=SimpleNamespace(size=5, index=np.arange(5)), pilot_rays=8)
+    AdaptiveRenderer.pilot_rays(own, band, SimpleNamespace(span_us=(0.0, 10.0)), (3.0, 9.0))
+    assert own.counts.pilot_rays == 68
 
 
 def test_a_run_begins_with_the_flux_of_its_anchor():

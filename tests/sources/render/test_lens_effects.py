@@ -9,12 +9,16 @@ import rendering
 from scipy.special import j1
 
 import hesim_render as hr
+from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.recording.manifest import build
 from hesim_render.sources.render import RenderedFlux
+from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.glare import VeilingGlare
+from hesim_render.sources.render.primary_rays import RayFactory
 from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
+from hesim_render.spectral.spectrum import RENDERABLE_NM
 
 CAMERA = {"origin_m": [0, 0, 1]}
 SUN = {"type": "directional", "illuminance_lux": 1000, "direction": [0, 0, -1]}
@@ -104,6 +108,25 @@ def test_colours_are_as_much_larger_as_the_file_says():
     expected = 0.123 * 3200 * (1 + np.interp(bands, told["wavelength_nm"], told["relative"]))
     np.testing.assert_allclose(rim, expected, atol=0.02)
     assert np.ptp(expected) > 2
+
+
+@pytest.mark.parametrize("end", [0, 1])
+def test_colours_at_the_ends_of_the_spectrum_have_their_own_size(end):
+    """A magnification that still changes in the last nanometre, against the pinhole with the factor written out."""
+    nm, larger = [RENDERABLE_NM[0], RENDERABLE_NM[0] + 1, RENDERABLE_NM[1] - 1, RENDERABLE_NM[1]], [0.02, 0, 0, 0.03]
+    told = {"wavelength_nm": nm, "relative": larger}
+    sensor = rendering.mono(16, 12, lens__lateral_chromatic=told)
+    rays = RayFactory(place_camera(rendering.make_scene(objects=[WALL], light=SUN, camera=CAMERA).spec, sensor))
+    types = jit()
+    asked = np.array([0.0, 0.5]) * (1 - 2 * end) + RENDERABLE_NM[end]
+    place = types.Float(3.0), types.Float(2.0)
+    middle = types.Float(0.5), types.Float(0.5)
+    plain = rays.towards(place[1], place[0], *middle)[1].numpy().reshape(3)
+    _, direction, _ = rays.through_lens(place, middle, None, types.Float(asked))
+    found = direction.numpy().reshape(3, 2)
+    slope = found[:2] / found[2]
+    factor = 1 + larger[3 * end] * np.array([1, 0.5])
+    np.testing.assert_allclose(slope * factor, (plain[:2] / plain[2])[:, None] * np.ones(2), rtol=4e-4)
 
 
 def test_a_dispersive_lens_keeps_the_light_of_an_even_picture():

@@ -238,6 +238,7 @@ def test_rays_leave_the_pupil_through_the_plane_in_focus_with_the_cosine_of_thei
     sine2 /= sine2 + image_m**2
     edge2 = (3e-3 / 1.4 / image_m) ** 2
     np.testing.assert_allclose(sine2 / (edge2 / (1 + edge2)), u, atol=1e-4)
+    np.testing.assert_allclose(np.mod(np.arctan2(-start[:, 1], start[:, 0]) / (2 * np.pi), 1), v, atol=1e-4)
     shown = np.column_stack([(col - 511.5) * 5e-6, -(row - 511.5) * 5e-6]) / image_m
     met = start[:, :2] + way[:, :2] * (-0.2 / way[:, 2])[:, None]
     np.testing.assert_allclose(met, 0.2 * shown, atol=1e-6)
