@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import norm
 
 from hesim_render.calibrate.aps import output as frames_output
-from hesim_render.calibrate.aps import pairs_output, pairs_required
+from hesim_render.calibrate.aps import pair_levels, pairs_output, pairs_required
 from hesim_render.calibrate.aps.common_mode import Shared
 from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal
@@ -366,10 +366,10 @@ def test_captures_are_refused_from_their_limits_on(part, is_refused):
     high = np.array([[100.0, 100.0], [100.0, 100 + 8.16 * part]])  # 8 % of 102.04
     signal = np.full((5, 7), 500.0)
     signal[:4, :6] = np.tile(high, (2, 3))
-    act = partial(pairs_required.require_one_colour, pairs, signal)
+    act = partial(pair_levels.require_one_colour, ENTRY, signal)
     assert refused(act, "92, 92, 92, 100 %") is is_refused
     # with a spread of a third of that and more within each place, the pixels have no colour
-    pairs_required.require_one_colour(pairs, signal + np.random.default_rng(1).normal(0, 9.0, signal.shape))
+    pair_levels.require_one_colour(ENTRY, signal + np.random.default_rng(1).normal(0, 9.0, signal.shape))
     curve = SimpleNamespace(at=lambda light: 2.0 * light)
     light = np.array([1.0, 40.0, 60.0, 80.0, 100.0])
     off = np.array(
