@@ -2,8 +2,9 @@
 
     python benchmarks/forecasts.py [PAIR ...] [--again]
 
-Each pair is a process of its own. It prints the estimated and the counted rays (picture and pilot), and the
-estimated time beside that of the whole process, start included. Nothing of the estimate was fitted on these pairs.
+Each pair is a process of its own. It prints the estimated and the counted rays (picture and pilot), and the estimated
+time beside that from the estimate to the end of the run, with its audit and files. Nothing of the estimate was fitted
+on these pairs.
 Rays are those of any machine; times need an otherwise idle one, with kernels compiled before: `--again` runs each
 pair twice and prints the second time.
 """
@@ -49,26 +50,29 @@ def one(scene, sensor, seconds, region):
     import hesim_render as hr
     from hesim_render.core.region import parse_roi
 
-    estimates = []
+    estimates, begins = [], []
     sensor = hr.load_sensor(sensor)
     if region is not None:
         sensor = sensor.crop(*parse_roi(region))
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        hr.simulate(scene, sensor, duration_s=seconds, out=out, progress=False, on_estimate=estimates.append)
+        hr.simulate(
+            scene, sensor, duration_s=seconds, out=out, progress=False,
+            on_estimate=lambda estimate: (estimates.append(estimate), begins.append(time.monotonic())),
+        )  # fmt: skip
+        own_seconds = time.monotonic() - begins[0]
         recording = json.loads((out / "recording.json").read_text())
     render = recording["settings"]["render"]
     rays = render["rays"] + render["pilot_rays"]
-    print(json.dumps([estimates[0].rays, estimates[0].seconds, rays, recording["counts"]["events"]]))
+    print(json.dumps([estimates[0].rays, estimates[0].seconds, rays, own_seconds, recording["counts"]["events"]]))
 
 
 def measured(pair):
-    """Estimated rays, estimated time, counted rays, events, and the time of a process."""
-    begin = time.monotonic()
+    """Estimated rays and time, those of the run, and its events."""
     ran = subprocess.run([sys.executable, __file__, "--one", *map(str, pair)], capture_output=True, text=True)
     if ran.returncode:
         raise SystemExit(ran.stderr)
-    return *json.loads(ran.stdout.splitlines()[-1]), time.monotonic() - begin
+    return json.loads(ran.stdout.splitlines()[-1])
 
 
 def main():
@@ -87,7 +91,7 @@ def main():
         if asked.pair and name not in asked.pair:
             continue
         for _ in range(1 + asked.again):
-            rays, seconds, own_rays, events, own_seconds = measured(pair)
+            rays, seconds, own_rays, own_seconds, events = measured(pair)
         of_rays, of_time = rays / own_rays, seconds / own_seconds
         count += 1
         right_rays += abs(of_rays - 1) <= RAYS_REL

@@ -385,11 +385,7 @@ main(sys.argv[2:])
 
 @pytest.mark.parametrize(
     ("number", "when", "left"),
-    [
-        pytest.param(signal.SIGINT, "before", [], marks=pytest.mark.slow),
-        (signal.SIGTERM, "before", []),
-        (signal.SIGINT, "after", [".o.unfinished"]),
-    ],
+    [(signal.SIGINT, "before", []), (signal.SIGTERM, "before", []), (signal.SIGINT, "after", [".o.unfinished"])],
 )
 def test_interrupt_exits_130_and_leaves_what_was_kept_or_nothing(number, when, left, tmp_path):
     child = subprocess.Popen(

@@ -1,5 +1,6 @@
 """Boxes, outlines and speeds of moving objects hold at every instant, keyframes or not."""
 
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -241,3 +242,52 @@ def test_a_swept_outline_is_as_much_wider_as_its_object_may_stray(flat):
     for low, high in (([51.4, 0], [200, 100]), ([0, 0], [8.6, 100]), ([0, 41.4], [200, 100]), ([0, 0], [200, 18.6])):
         zoom._low, zoom._high = np.array(low, float), np.array(high, float)
         assert Zoom._outline(zoom, 7, None, 0.0, 1.0) is None
+
+
+def _many_keys(count, repeat=False):
+    """A track of uneven steps, as a motion-capture file has them, µs and m."""
+    rng = np.random.default_rng(count)
+    times = 130 + np.append(0, np.cumsum(rng.integers(3, 90, count - 1)))
+    return track(
+        *({"t_us": int(t), "translation_m": [0.001 * k, 0.2, -0.003 * k]} for k, t in enumerate(times)), repeat=repeat
+    )
+
+
+@pytest.mark.parametrize("repeat", [False, True])
+def test_pieces_are_all_segments_that_an_interval_meets(repeat):
+    """Each segment was compared with the interval; at keyframes, both that meet there count."""
+    path = _many_keys(40, repeat)
+    knots = path.knots_us
+    rng, period = np.random.default_rng(3), path.period_us
+    intervals = [(knots[7], knots[9]), (knots[7], knots[7]), (knots[0] - 50.0, knots[0]), (knots[-1], knots[-1] + 9.0)]
+    intervals += [tuple(np.sort(rng.uniform(knots[0] - 40, knots[-1] + 60, 2))) for _ in range(50)]
+    for begin, end in intervals:
+        spans = [tuple(np.clip([begin, end], knots[0], knots[-1]) - knots[0])]
+        if repeat:
+            first = (begin - knots[0]) % period
+            last = first + end - begin
+            spans = [(first, last)] if last <= period else [(first, period), (0.0, last - period)]
+            if end - begin >= period:
+                spans = [(0.0, period)]
+        local = knots - knots[0]
+        expected = [
+            (k, max(low, local[k]), min(high, local[k + 1]))
+            for low, high in spans for k in range(39) if max(low, local[k]) <= min(high, local[k + 1])
+        ]  # fmt: skip
+        got = path.pieces(begin, end)
+        assert [piece.segment for piece in got] == [k for k, _, _ in expected]
+        for piece, (k, a, b) in zip(got, expected, strict=True):
+            length = local[k + 1] - local[k]
+            np.testing.assert_allclose(
+                (piece.first, piece.last, piece.length_us), ((a - local[k]) / length, (b - local[k]) / length, b - a),
+                atol=1e-12,
+            )  # fmt: skip
+
+
+def test_short_intervals_of_long_tracks_take_no_longer():
+    """Tens of thousands of keyframes: each call went through all of them, most of the time of an audit of `fan`."""
+    path = _many_keys(30_000)
+    begin = time.process_time()
+    for k in range(300):
+        assert path.pieces(1000.0 + k, 1000.5 + k)
+    assert time.process_time() - begin < 1.5  # it took 3 s and more

@@ -169,11 +169,12 @@ class Trajectory:
             spans = [(first, last)] if last <= period else [(first, period), (0.0, last - period)]
         pieces = []
         for low, high in spans:
-            for segment in range(knots.size - 1):
+            # only segments that end at or after its begin, and begin at or before its end: tracks have many
+            first_segment = max(0, int(np.searchsorted(knots, low, side="left")) - 1)
+            for segment in range(first_segment, min(knots.size - 1, int(np.searchsorted(knots, high, side="right")))):
                 a, b = max(low, knots[segment]), min(high, knots[segment + 1])
-                if a <= b:
-                    length = knots[segment + 1] - knots[segment]
-                    pieces.append(Piece(segment, (a - knots[segment]) / length, (b - knots[segment]) / length, b - a))
+                length = knots[segment + 1] - knots[segment]
+                pieces.append(Piece(segment, (a - knots[segment]) / length, (b - knots[segment]) / length, b - a))
         return pieces
 
     def ends_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
