@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.units import US_PER_S
@@ -96,8 +98,13 @@ def event_statistics(stream: EventStream) -> EventStatistics:
     polarity, intervals, series, active, bursts, pixels = columns
     return EventStatistics(
         str(stream.source), (rows, cols), part_us / US_PER_S, polarity, intervals, series, active,
-        max(1, part_us // ACTIVE_US), bursts, pixels,
+        _active_windows(part_us), bursts, pixels,
     )  # fmt: skip
+
+
+def _active_windows(part_us: int) -> int:
+    """Windows of `ACTIVE_US` that are whole in a part; a shorter part is one."""
+    return max(1, part_us // ACTIVE_US)
 
 
 def _part(
@@ -124,8 +131,9 @@ def _part(
     starts = np.flatnonzero(first | (times - before_us > GAP_US))
     length = np.diff(np.append(starts, own.size))
     bursts = np.bincount(np.minimum(length, LONGEST), minlength=LONGEST + 1)
-    # pixels active in a window, each once; with each neighbour, the windows in which both are
-    key = np.unique((t_us // ACTIVE_US) * (rows * cols) + pixel)
+    # pixels active in a whole window, each once; with each neighbour, the windows in which both are
+    whole = t_us // ACTIVE_US < _active_windows(part_us)
+    key = np.unique((t_us[whole] // ACTIVE_US) * (rows * cols) + pixel[whole])
     row, col = np.divmod(key % (rows * cols), cols)
     active = [int(key.size)]
     for down, right in NEIGHBOURS:
@@ -136,6 +144,8 @@ def _part(
 
 #: Draws of the bootstrap, and hot pixels: so many times the usual rate.
 _DRAWS, _SEED, _HOT = 200, 1, 10.0
+#: Draws of 20 parts scatter less than their means do: Student's factor of 19 degrees of freedom, and √(20/19).
+_WIDER = float(student.ppf(0.975, PARTS - 1) / norm.ppf(0.975) * np.sqrt(PARTS / (PARTS - 1)))
 _Draw = NDArray[np.intp]
 
 
@@ -147,7 +157,7 @@ class EventDistance:
     ----------
     name, definition : what it is, and how it is defined.
     value : distance, 0 for equal streams.
-    interval_95 : of the bootstrap, centred on the value.
+    interval_95 : of the true distance, by the bootstrap; from 0 where the streams do not differ.
     within : distance of two draws of the first stream, of which 95 of 100 are below.
     first, second : what it is the distance of, where that is a number.
     """
@@ -201,20 +211,13 @@ def event_distances(first: EventStatistics, second: EventStatistics) -> list[Eve
         theirs = [figure(second, draw) for draw in draws[2]]
         spread = [distance(x, y) for x, y in zip(ours, theirs, strict=True)]
         own = [distance(x, y) for x, y in zip(ours, again, strict=True)]
-        value = float(distance(a, b))
-        # drawn parts repeat, which shifts a distance: the draws are centred on that of the whole
-        low, high = np.maximum(np.percentile(spread, (2.5, 97.5)) + value - np.median(spread), 0.0)
+        value, within = float(distance(a, b)), _WIDER * float(np.percentile(own, 95))
+        # noise makes distances larger, those of drawn parts once more: the lower end has that taken off
+        middle, top = np.percentile(spread, (50, 97.5))
+        low = max(value - _WIDER * float(top - min(middle, value)), 0.0) if value > within else 0.0
+        high = value + _WIDER * float(top - middle)
         numbers = (float(a[0]), float(b[0])) if is_number else (None, None)
-        result.append(
-            EventDistance(
-                name,
-                definition,
-                value,
-                (float(low), float(high)),
-                float(np.percentile(own, 95)),
-                *numbers,
-            )
-        )
+        result.append(EventDistance(name, definition, value, (low, high), within, *numbers))
     return result
 
 

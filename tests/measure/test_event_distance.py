@@ -88,7 +88,8 @@ def by_loop(t_us, pixel, begin_us, part_us, shape):
         part, inside = divmod(time - begin_us, part_us)
         if inside // 1000 < series.shape[1]:
             series[part, inside // 1000] += 1
-        active[part].add((inside // 5000, place // cols, place % cols))
+        if inside // 5000 < part_us // 5000:
+            active[part].add((inside // 5000, place // cols, place % cols))
         if place in last:
             intervals.append(max(time - last[place], 1))
         if place in open_runs[part] and time - last[place] <= 1000:
@@ -189,9 +190,60 @@ def test_bounds_are_these_percentiles_of_the_draws(monkeypatch):
     monkeypatch.setattr(event_distance, "_FIGURES", [("a", "b", figure, distance, False)])
     streams = [SimpleNamespace(shape=SHAPE, source=name) for name in ("one", "other")]
     (found,) = event_distances(*streams)
-    # the p-th percentile of 0 to 199 is 1.99 p; the draws are centred on the whole
-    assert found.interval_95 == pytest.approx((300 + 1.99 * (2.5 - 50), 300 + 1.99 * (97.5 - 50)))
-    assert found.within == pytest.approx(1.99 * 95) and found.value == 300
+    # the p-th percentile of 0 to 199 is 1.99 p; Student's factor is 2.093 in place of 1.96
+    wider = 2.0930 / 1.9600 * np.sqrt(20 / 19)
+    half = wider * 1.99 * (97.5 - 50)
+    assert found.interval_95 == pytest.approx((300 - half, 300 + half), rel=1e-4)
+    assert found.within == pytest.approx(wider * 1.99 * 95, rel=1e-4) and found.value == 300
+
+
+def test_the_lower_end_has_the_noise_taken_off_and_is_0_where_streams_do_not_differ(monkeypatch):
+    """Draws 200 + k between the streams, about a whole of 250: their median is 50 above it."""
+    for within, low in ((210.0, 250 - 1.0955 * (200 + 1.99 * 97.5 - 250)), (240.0, 0.0)):
+        between = iter(200.0 + np.arange(200))
+
+        def distance(one, other, own=within, draws=between):
+            return 250.0 if one[1] else own if one[0] == other[0] else next(draws)
+
+        figure = ("a", "b", lambda s, draw: np.array([s.source, np.array_equal(draw, np.arange(20))], object),
+                  distance, False)  # fmt: skip
+        monkeypatch.setattr(event_distance, "_FIGURES", [figure])
+        (found,) = event_distances(*(SimpleNamespace(shape=SHAPE, source=name) for name in ("one", "other")))
+        assert found.interval_95 == pytest.approx((low, 250 + 1.0955 * 1.99 * 47.5), rel=1e-3)
+
+
+def test_pixels_that_know_nothing_of_one_another_have_no_correlation():
+    """A part of 129.98 ms has 25 whole windows; events after them, counted as those of a 26th, would make it −0.0045."""
+    found = np.mean([event_distance._over_space(poisson(k), np.arange(20)) for k in range(60, 72)], axis=0)
+    assert np.all(np.abs(found) < 4 * 0.0013 / np.sqrt(12))
+
+
+def truth_of(changes, more):
+    """Distances of the mean figures of 40 streams each."""
+    means = [
+        [np.mean([figure[2](poisson(seed, **keys), np.arange(20)) for seed in range(90_000, 90_040)], axis=0)
+         for figure in event_distance._FIGURES]
+        for keys in (changes, changes | more)
+    ]  # fmt: skip
+    return {figure[0]: figure[3](a, b) for figure, a, b in zip(event_distance._FIGURES, *means, strict=True)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("changes", "more"), (
+    ({}, {}),
+    ({"hot": 6}, {}),
+    ({"rhythm": 0.4, "burst": 3}, {}),
+    ({}, {"rate": 1.02, "on": 0.606, "rhythm": 0.1, "pairs": 0.01}),
+    ({"rhythm": 0.4, "burst": 2}, {"rate": 1.1, "on": 0.62, "rhythm": 0.5, "pairs": 0.1}),
+), ids=("equal", "equal, hot", "equal, bursts", "nearly equal", "different"))  # fmt: skip
+def test_intervals_hold_the_true_distance_of_sixty_pairs(changes, more):
+    """Fewer than 51 of 60 have a chance of 1e-3 where 94 of 100 are expected."""
+    true = truth_of(changes, more) if more else {}
+    inside = {figure[0]: 0 for figure in event_distance._FIGURES}
+    for seed in range(1000, 1120, 2):
+        for one in event_distances(poisson(seed, **changes), poisson(seed + 1, **(changes | more))):
+            inside[one.name] += one.interval_95[0] <= true.get(one.name, 0.0) <= one.interval_95[1]
+    assert min(inside.values()) >= 51, inside
 
 
 def test_an_interval_holds_its_value_where_drawn_parts_have_other_ones():
