@@ -170,6 +170,10 @@ _OF_ALL = {
     "leak_dark_hz": "leak in the dark", "leak_growth_hz_per_lux": "growth of the leak", "hot_share": "hot pixels",
     "silent_share": "silent pixels", "dead_time_us": "dead time", "readout_limit_events_per_s": "read-out limit",
 }  # fmt: skip
+#: Keys of ``evs.noise_spread``.
+_OF_NOISE = {
+    "bandwidth_rel": "spread of bandwidth", "odd_rows_rel": "bandwidth, odd rows", "odd_cols_rel": "odd columns",
+}  # fmt: skip
 
 
 def recording(
@@ -214,6 +218,7 @@ def recording(
         lines.append(f"{one['file']}{light}: {one['events']} events in {one['seconds']:.4g} s")
         lines += [f"  {_line(text, one[name])}" for name, text in _OF_ONE.items()]
     lines += [_line(text, result[name]) for name, text in _OF_ALL.items()]
+    lines += [_line(text, result["noise_spread"][name]) for name, text in _OF_NOISE.items()]
     lines += [f"look at: {finding['file']}: {finding['text']}" for finding in result["findings"]]
     lines += [] if out is None else [f"in {out}"]
     console.result("\n".join(lines), {"calibration": out, **result})

@@ -205,17 +205,19 @@ def event_distances(first: EventStatistics, second: EventStatistics) -> list[Eve
     draws = rng.integers(0, PARTS, (3, _DRAWS, PARTS))
     whole = np.arange(PARTS)
     result = []
-    for name, definition, figure, distance, is_number in _FIGURES:
+    for name, definition, figure, distance, is_number, number in _FIGURES:
         a, b = figure(first, whole), figure(second, whole)
         ours, again = ([figure(first, draw) for draw in part] for part in draws[:2])
         theirs = [figure(second, draw) for draw in draws[2]]
         spread = [distance(x, y) for x, y in zip(ours, theirs, strict=True)]
         own = [distance(x, y) for x, y in zip(ours, again, strict=True)]
-        value, within = float(distance(a, b)), _WIDER * float(np.percentile(own, 95))
+        # what is in none of n has a share of 3/n at most
+        rare = 0.0 if number is None else 3.0 / max(float(min(number(first), number(second))), 1.0)
+        value, within = float(distance(a, b)), max(_WIDER * float(np.percentile(own, 95)), rare)
         # noise makes distances larger, those of drawn parts once more: the lower end has that taken off
         middle, top = np.percentile(spread, (50, 97.5))
         low = max(value - _WIDER * float(top - min(middle, value)), 0.0) if value > within else 0.0
-        high = value + _WIDER * float(top - middle)
+        high = value + max(_WIDER * float(top - middle), rare)
         numbers = (float(a[0]), float(b[0])) if is_number else (None, None)
         result.append(EventDistance(name, definition, value, (low, high), within, *numbers))
     return result
@@ -288,19 +290,30 @@ _Figure = tuple[
     Callable[[EventStatistics, _Draw], NDArray[np.float64]],
     Callable[[NDArray[np.float64], NDArray[np.float64]], float],
     bool,
+    Callable[[EventStatistics], float] | None,
 ]
+#: Name, definition, figure, distance, whether it is a number, and what shares are of.
 _FIGURES: Sequence[_Figure] = (
-    ("rate", "|ln| of the ratio of the events a pixel and second", _rate, _ratio, True),
+    ("rate", "|ln| of the ratio of the events a pixel and second", _rate, _ratio, True, None),
     (
-        "intervals",
-        "Kolmogorov-Smirnov distance of the intervals between events of a pixel",
-        _intervals,
-        _difference,
-        False,
+        "intervals", "Kolmogorov-Smirnov distance of the intervals between events of a pixel",
+        _intervals, _difference, False, lambda one: one.intervals.sum(),
     ),
-    ("polarity", "difference of (ON - OFF)/(ON + OFF)", _asymmetry, _difference, True),
-    ("time", "rms difference of the autocorrelation of the rate at lags of 1 to 32 ms", _over_time, _rms, False),
-    ("space", "rms difference of the correlation of active pixels in 5 ms, 1 and 2 px apart", _over_space, _rms, False),
-    ("hot pixels", "difference of the shares of pixels above ten times the usual rate", _hot, _difference, True),
-    ("bursts", "Kolmogorov-Smirnov distance of the lengths of bursts, gaps up to 1 ms", _bursts, _difference, False),
-)
+    ("polarity", "difference of (ON - OFF)/(ON + OFF)", _asymmetry, _difference, True, None),
+    (
+        "time", "rms difference of the autocorrelation of the rate at lags of 1 to 32 ms",
+        _over_time, _rms, False, None,
+    ),
+    (
+        "space", "rms difference of the correlation of active pixels in 5 ms, 1 and 2 px apart",
+        _over_space, _rms, False, None,
+    ),
+    (
+        "hot pixels", "difference of the shares of pixels above ten times the usual rate",
+        _hot, _difference, True, lambda one: one.pixels.shape[1],
+    ),
+    (
+        "bursts", "Kolmogorov-Smirnov distance of the lengths of bursts, gaps up to 1 ms",
+        _bursts, _difference, False, lambda one: one.bursts.sum(),
+    ),
+)  # fmt: skip

@@ -187,7 +187,7 @@ def test_bounds_are_these_percentiles_of_the_draws(monkeypatch):
             return 300.0
         return next(within if one[0] == other[0] else between)
 
-    monkeypatch.setattr(event_distance, "_FIGURES", [("a", "b", figure, distance, False)])
+    monkeypatch.setattr(event_distance, "_FIGURES", [("a", "b", figure, distance, False, None)])
     streams = [SimpleNamespace(shape=SHAPE, source=name) for name in ("one", "other")]
     (found,) = event_distances(*streams)
     # the p-th percentile of 0 to 199 is 1.99 p; Student's factor is 2.093 in place of 1.96
@@ -206,16 +206,29 @@ def test_the_lower_end_has_the_noise_taken_off_and_is_0_where_streams_do_not_dif
             return 250.0 if one[1] else own if one[0] == other[0] else next(draws)
 
         figure = ("a", "b", lambda s, draw: np.array([s.source, np.array_equal(draw, np.arange(20))], object),
-                  distance, False)  # fmt: skip
+                  distance, False, None)  # fmt: skip
         monkeypatch.setattr(event_distance, "_FIGURES", [figure])
         (found,) = event_distances(*(SimpleNamespace(shape=SHAPE, source=name) for name in ("one", "other")))
         assert found.interval_95 == pytest.approx((low, 250 + 1.0955 * 1.99 * 47.5), rel=1e-3)
 
 
 def test_pixels_that_know_nothing_of_one_another_have_no_correlation():
-    """A part of 129.98 ms has 25 whole windows; events after them, counted as those of a 26th, would make it −0.0045."""
+    """A part of 129.98 ms has 25 whole windows; events after them, counted as those of a 26th, make it −0.0045."""
     found = np.mean([event_distance._over_space(poisson(k), np.arange(20)) for k in range(60, 72)], axis=0)
     assert np.all(np.abs(found) < 4 * 0.0013 / np.sqrt(12))
+
+
+def test_one_burst_in_thousands_is_no_difference():
+    """None in the first stream of 54,000, one in the second, in 18,000: any draw of the first has none."""
+    one, other = poisson(31), poisson(32)
+    one.bursts[:], other.bursts[:] = 0, 0
+    one.bursts[:, 1], other.bursts[:, 1], other.bursts[3, 2] = 2700, 900, 1
+    found = {d.name: d for d in event_distances(one, other)}
+    assert found["bursts"].value == pytest.approx(1 / 18_001) and not found["bursts"].differs
+    assert found["bursts"].within == pytest.approx(3 / 18_001)
+    assert found["bursts"].interval_95[1] >= 3.99 / 18_001 and found["hot pixels"].interval_95 == (0.0, 3 / PIXELS)
+    other.bursts[3, 2] = 4
+    assert {d.name: d for d in event_distances(one, other)}["bursts"].differs
 
 
 def truth_of(changes, more):

@@ -18,24 +18,33 @@ def _events(found, cols):
     return events
 
 
-def still_events(rng, theta_on, theta_off, sigma, drift, *, cutoff_hz, seconds, shape):
+def still_events(rng, theta_on, theta_off, sigma, drift, *, cutoff_hz, seconds, shape, nodes=16):
     """Events of pixels with own thresholds [pixel], noise of ln x, and drift [pixel] in ln units a second.
 
-    The pixels have run for a while before the first µs that counts.
+    The pixels have run for a while before the first µs that counts. The corner of the noise may be one for each;
+    the fastest pixel has so many `nodes` in a period.
     """
+    cutoff_hz = np.asarray(cutoff_hz, float)
     pole = 2 * np.pi * cutoff_hz / np.sqrt(np.sqrt(2) - 1)
-    dt = 1 / (16 * cutoff_hz)
+    dt = 1 / (nodes * cutoff_hz.max())
     h = pole * dt
-    move = np.exp(-h) * np.array([[1 + h, h], [-h, 1 - h]])
-    fresh = np.linalg.cholesky(np.eye(2) - move @ move.T)
+    # what is left of both poles after a step, and the triangle of the new noise
+    keep = np.exp(-h) * np.array([1 + h, h, -h, 1 - h])
+    first = np.sqrt(1 - keep[0] ** 2 - keep[1] ** 2)
+    mixed = -(keep[0] * keep[2] + keep[1] * keep[3]) / first
+    second = np.sqrt(1 - keep[2] ** 2 - keep[3] ** 2 - mixed**2)
     size = theta_on.size
     state = rng.standard_normal((2, size))
     level = sigma * state[0]
     reference = level - theta_on * rng.random(size)
     found = [(np.empty(0, int), np.empty(0, int), np.empty(0, int))]
-    warm = round(30 / cutoff_hz / dt)
+    warm = round(30 / cutoff_hz.min() / dt)
     for k in range(-warm, round(seconds / dt)):
-        state = move @ state + fresh @ rng.standard_normal(state.shape)
+        z = rng.standard_normal(state.shape)
+        state = np.stack([
+            keep[0] * state[0] + keep[1] * state[1] + first * z[0],
+            keep[2] * state[0] + keep[3] * state[1] + mixed * z[0] + second * z[1],
+        ])  # fmt: skip
         before, level = level, sigma * state[0]
         reference -= drift * dt
         on, off = level - reference >= theta_on, level - reference <= -theta_off

@@ -10,6 +10,7 @@ import numpy as np
 
 from hesim_render.calibrate.estimate import not_identifiable
 from hesim_render.calibrate.recordings import still, target
+from hesim_render.calibrate.recordings.noise_spread import noise_spread, surest
 from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
 from hesim_render.calibrate.recordings.tally import EventTally, tally
@@ -154,7 +155,7 @@ def figures(
     return {
         "sensor": {"rows": tallies[0].shape[0], "cols": tallies[0].shape[1]},
         "recordings": entries, "threshold_ratio": result.ratio, **of_target.entries, "leak_dark_hz": result.dark,
-        "leak_growth_hz_per_lux": result.growth,
+        "leak_growth_hz_per_lux": result.growth, "noise_spread": surest([noise_spread(one) for one in calm]),
         "hot_share": still.hot_share(tallies), "silent_share": still.silent_share(tallies),
         "dead_time_us": _dead_time(tallies, moving), "readout_limit_events_per_s": limit, "findings": findings,
     }  # fmt: skip

@@ -150,7 +150,7 @@ def _mean(chance: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(_LEVELS[-1] - np.trapezoid(chance, _LEVELS, axis=-1))
 
 
-def _median(counts: NDArray, part: float = 0.5) -> float:
+def quantile_us(counts: NDArray, part: float = 0.5) -> float:
     """Place of a quantile in a histogram of times with even logarithmic steps, µs; 0 without any."""
     if counts.sum() == 0:
         return 0.0
@@ -167,7 +167,7 @@ def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] 
     leak_hz : leak while it moved, thresholds of ON events per second.
     ratio : θ₋/θ₊.
     """
-    interval_s = [_median(tally.same.sum(axis=1)[k]) * S_PER_US for k in range(2)]
+    interval_s = [quantile_us(tally.same.sum(axis=1)[k]) * S_PER_US for k in range(2)]
     period_s = tally.period_s()
     result, is_noisy = [], False
     for k, own in enumerate((ratio, 1 / ratio)):
@@ -175,7 +175,7 @@ def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] 
         whole = gaps.sum(axis=0)
         if whole.sum() < 1000 or period_s is None or not all(interval_s):
             return None
-        middle_s, upper_s = (_median(whole, part) * S_PER_US for part in (0.5, 0.85))
+        middle_s, upper_s = (quantile_us(whole, part) * S_PER_US for part in (0.5, 0.85))
         up_s, down_s = interval_s[k], interval_s[1 - k]
         # the last event comes half an interval before the top; half a threshold of its own and one of the other
         # polarity lie between it and the first event of the fall
