@@ -1,0 +1,134 @@
+"""Spread of the noise's bandwidth from a still scene, on pixels of NumPy alone (`tests/support/still_pixels.py`)."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hesim_render.calibrate.recordings import noise_spread as of_noise
+from hesim_render.calibrate.recordings.noise_spread import KEYS, noise_spread, surest
+from hesim_render.calibrate.recordings.tally import tally
+from hesim_render.exchange import EventStream
+from tests.support.still_pixels import random_events, still_events
+
+SHAPE = (24, 33)
+PIXELS = SHAPE[0] * SHAPE[1]
+
+
+def sensor(seed, shape=SHAPE, seconds=6.0, nodes=40):
+    """A sensor of its own for each seed: truth, and events of still light. Coarse steps make fast pixels slower."""
+    rng = np.random.default_rng(seed)
+    pixels = shape[0] * shape[1]
+    mismatch, ratio = rng.uniform(0.02, 0.12), rng.uniform(0.8, 1.35)
+    on, off = (0.2 * part * (1 + mismatch * rng.standard_normal(pixels)) for part in (1, ratio))
+    spread, rows, cols = rng.uniform(0.15, 0.5), rng.uniform(-0.3, 0.3), rng.uniform(-0.15, 0.15)
+    y, x = np.divmod(np.arange(pixels), shape[1])
+    cutoff_hz = rng.uniform(20, 60) * np.exp(spread * rng.standard_normal(pixels))
+    cutoff_hz *= (1 + rows * (2 * (y % 2) - 1)) * (1 + cols * (2 * (x % 2) - 1))
+    sigma = 0.2 * np.sqrt(ratio) / rng.uniform(1.3, 2.6)
+    leak = np.full(pixels, 0.2 * rng.uniform(0, 0.3))
+    events = still_events(
+        rng, on, off, sigma, leak, cutoff_hz=cutoff_hz, seconds=seconds, shape=shape, nodes=nodes
+    )  # fmt: skip
+    return dict(zip(KEYS, (spread, rows, cols), strict=True)), tally(EventStream.of(events, shape))
+
+
+def holds(entry, truth):
+    low, high = entry.get("interval_95", (0.0, entry.get("upper_limit")))
+    return low <= truth <= high
+
+
+def test_intervals_hold_the_spread_of_a_sensor():
+    """The seed is fixed; a hundred sensors follow."""
+    truth, one = sensor(16, seconds=3.0, nodes=20)
+    found = noise_spread(one)
+    assert all(holds(found[key], truth[key]) for key in KEYS)
+    assert all(found[key]["standard_error"] < 0.016 for key in KEYS)
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_spread_of_a_hundred_sensors():
+    hits = dict.fromkeys(KEYS, 0)
+    for seed in range(500, 600):
+        truth, one = sensor(seed)
+        found = noise_spread(one)
+        for key in KEYS:
+            hits[key] += holds(found[key], truth[key])
+    assert all(90 <= count <= 99 for count in hits.values()), hits
+
+
+def made_tally(rates, seconds=1.0, gap_us=9000.0):
+    """A tally of counts that are given exactly, [polarity, half, pixel], and of one time between polarities."""
+    counts = np.array(rates)
+    gaps = np.zeros((2, 20, 32 * 26), np.int64)
+    gaps[:, :, int(32 * np.log2(gap_us))] = 50
+    pixels = counts.shape[2]
+    return SimpleNamespace(
+        counts=counts, used=np.ones(pixels, bool), shape=SHAPE, pixels=pixels, gaps=gaps, seconds=seconds,
+        group=np.random.default_rng(0).integers(0, 20, pixels),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("turn", "fall"), [(0.25, 2.98), (0.45, 2.08)])
+def test_thresholds_have_no_part_in_it(turn, fall):
+    """Rates of two thresholds without noise of counting: ln n₊ = ln f − (k+1)/2 δ₊ − (k−1)/2 δ₋."""
+    rng, pixels = np.random.default_rng(8), 24 * 330
+    f = 0.3 * rng.standard_normal(pixels)
+    on, off = 0.09 * rng.standard_normal((2, pixels))
+    up = 100 * np.exp(f - (fall + 1) / 2 * on - (fall - 1) / 2 * off)
+    down = 100 * np.exp(f - (fall - 1) / 2 * on - (fall + 1) / 2 * off)
+    one = made_tally([[up, up], [down, down]], seconds=2.0)
+    one.shape, wanted = (24, 330), turn * np.exp(-0.9 * 0.09)
+    one.gaps[:] = 0
+    one.gaps[:, :, round(32 * np.log2(wanted / (2 * (up.mean() + down.mean()) / 2.0) * 1e6))] = 50
+    found = noise_spread(one)
+    assert found["bandwidth_rel"]["value"] == pytest.approx(f.std(), rel=0.02)
+    assert abs(found["odd_rows_rel"]["value"]) < 3 * found["odd_rows_rel"]["standard_error"] < 0.05
+    # alike pixels of other thresholds have no spread
+    up, down = up / np.exp(f), down / np.exp(f)
+    one.counts = np.array([[up, up], [down, down]])
+    alike = noise_spread(one)["bandwidth_rel"]
+    assert alike["value"] == 0 and 0 < alike["upper_limit"] < 0.15 and "thresholds" in alike["note"]
+
+
+def test_patterns_are_those_of_rows_and_of_columns():
+    y, x = np.divmod(np.arange(PIXELS), SHAPE[1])
+    rate = 40 * (1 + 0.25 * (2 * (y % 2) - 1)) * (1 - 0.1 * (2 * (x % 2) - 1))
+    found = noise_spread(made_tally([[rate, rate], [0.8 * rate, 0.8 * rate]]))
+    assert found["odd_rows_rel"]["value"] == pytest.approx(0.25) and found["odd_cols_rel"]["value"] == pytest.approx(
+        -0.1
+    )
+    assert found["bandwidth_rel"]["value"] == 0 and found["bandwidth_rel"]["upper_limit"] < 1e-3
+
+
+def test_what_is_not_identifiable_says_why():
+    even = np.full(PIXELS, 40.0)
+    weak = noise_spread(made_tally([[even, even], [even, even]], gap_us=200.0))
+    assert "too weak" in weak["bandwidth_rel"]["reason"] and weak["odd_rows_rel"]["value"] == 0
+    leaking = noise_spread(made_tally([[even, even], [0.45 * even, 0.45 * even]]))
+    assert "2.2 ON events for an OFF event" in leaking["odd_cols_rel"]["reason"]
+    few = noise_spread(made_tally([[even, even], [0.12 * even, 0.12 * even]]))
+    assert "4.8 events of a polarity in half of the time; 5 are needed" in few["bandwidth_rel"]["reason"]
+    small = made_tally(np.full((2, 2, 12), 40.0))
+    small.shape = (3, 4)
+    assert "12 pixels are too few" in noise_spread(small)["bandwidth_rel"]["reason"]
+    assert "rate of every recording changes" in surest([])["odd_rows_rel"]["reason"]
+
+
+def test_of_several_recordings_the_surest_counts():
+    reason, wide = {"value": None, "reason": "a"}, {"value": 0.3, "interval_95": [0.1, 0.5]}
+    narrow, limit = {"value": 0.2, "interval_95": [0.1, 0.3]}, {"value": 0.0, "upper_limit": 0.1}
+    given = [dict.fromkeys(KEYS, one) for one in (reason, wide, narrow)]
+    given[1]["odd_cols_rel"] = limit
+    found = surest(given)
+    assert found["bandwidth_rel"] is narrow and found["odd_cols_rel"] is limit
+    assert surest([given[0], given[0]])["bandwidth_rel"] is reason
+
+
+def test_random_events_without_noise_of_a_level_have_no_spread_beyond_their_limit():
+    rng = np.random.default_rng(3)
+    found = noise_spread(
+        tally(EventStream.of(random_events(rng, np.full(PIXELS, 40.0), 0, seconds=3.0, shape=SHAPE), SHAPE))
+    )
+    assert found["bandwidth_rel"]["value"] == 0 and found["bandwidth_rel"]["upper_limit"] < 0.1
+    assert of_noise._TURN.size == of_noise._FALL.size
