@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import leads_out
+from hesim_render.core.guard import leads_out, printable
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.camera_raw import RAW_SUFFIXES
 from hesim_render.recording.emva_list import find_list, numbers, read_list
@@ -237,7 +237,8 @@ def _arranged(file: Path, spec: CaptureSpec, shape: tuple[int, int], series: lis
         raise SpecError(f"lists more than {_MOST_FRAMES} frames", file=file)
     for entry in series:
         if len(entry.files) < 2:
-            raise entry.error(f"{len(entry.files)} frame; a pair has two, and a variance follows from their difference")
+            only = f"{printable(entry.files[0].name)} alone" if entry.files else "no frame"
+            raise entry.error(f"{only}; a pair has two frames, and a variance follows from their difference")
     pairs = {
         lit: sorted((s for s in series if s.lit == lit and len(s.files) == 2), key=_order) for lit in (True, False)
     }

@@ -331,7 +331,10 @@ def no_series(lines, folder):
 
 
 BAD = {
-    "a frame of a pair is missing": (drop_second, r"EMVA1288_Data.txt:4: 452 photons, 400 µs: 1 frame; a pair has two"),
+    "a frame of a pair is missing": (
+        drop_second,
+        r"EMVA1288_Data.txt:4: 452 photons, 400 µs: b_000_00.png alone; a pair has two",
+    ),
     "a dark pair is missing": (drop_dark, r"EMVA1288_Data.txt:\d+: .*no dark pair of this exposure"),
     "a name leads out": (
         leave,
@@ -382,6 +385,12 @@ def stretched(series, number, frame):
     return ((frame >> 4).astype(np.uint32) * 5 // 4).astype(np.uint16)
 
 
+def with_a_hole(series, number, frame):
+    """8 bits; values from 121 to 126 are written as 127."""
+    grey = (frame >> 4).astype(np.uint16)
+    return np.where((grey > 120) & (grey < 127), 127, grey).astype(np.uint16)
+
+
 def drifting_pair(series, number, frame):
     return (frame * (0.9 if series.lit and number == 1 and series.exposure_s > 0.01 else 1.0)).astype(np.uint16)
 
@@ -409,6 +418,7 @@ def clipped(series, number, frame):
 
 SPOILED = {
     "8 bit with gaps": (stretched, "of .* grey values around the mean never occur: .* capture RAW frames$"),
+    "8 bit with one gap": (with_a_hole, "grey values 121 to 126 occur in none of the frames, .* capture RAW frames$"),
     "the light of a pair drifts": (drifting_pair, "the light drifts: the second frame is 1[01] % darker"),
     "the light of the long series drifts": (
         drifting_long,
@@ -496,3 +506,15 @@ def test_pairs_are_bins_of_the_fit_with_the_squares_of_their_variances():
     np.testing.assert_allclose(bins.products, used.sum(axis=1)[:, None] * light[:, None] ** np.arange(4))
     np.testing.assert_allclose(bins.exposure_s, [0.003, 0.023, 0.013])
     np.testing.assert_array_equal(bins.lit, [False, False, True])
+
+
+def test_a_hole_is_one_gap_wider_than_the_noise():
+    """Noise of 2 DN: three values that are missing are more, one is less, two gaps are not one hole."""
+    frame = np.rint(130 + 2 * np.random.default_rng(5).standard_normal((90, 80))).astype(np.uint16)
+    wide = np.where((frame > 128) & (frame < 132), 132, frame)
+    assert pair_levels._hole(wide, 255) == slice(129, 132)
+    assert pair_levels._hole(frame, 255) is None
+    assert pair_levels._hole(np.where(frame == 130, 131, frame), 255) is None
+    split = np.where(np.isin(frame, (128, 129, 131)), 132, frame)
+    assert pair_levels._hole(split, 255) is None
+    assert pair_levels._hole(wide[:10, :20], 255) is None  # 13 pixels of each value are no sign

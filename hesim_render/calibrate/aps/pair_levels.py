@@ -78,18 +78,27 @@ def pair_levels(pairs: PairSet, series: tuple[Series, ...], progress: Progress |
     full = pairs.spec.full_scale_dn
     different = list(dict.fromkeys(series))
 
-    def one(entry: Series) -> tuple[float, ...]:
+    def one(entry: Series) -> tuple[tuple[float, ...], slice | None, NDArray[np.bool_]]:
         first, second = pairs.frames(entry)
         result = pair_statistics(first, second, full)
         _check(entry, result, first, second, full)
-        return result
+        return result, _hole(first, full), np.bincount(first.ravel(), minlength=full + 1) > 0
 
+    seen = np.zeros(full + 1, np.bool_)
     with ThreadPoolExecutor(2) as two:
-        results = []
-        for number, measured in enumerate(two.map(one, different)):
+        results, holes = [], []
+        for number, (measured, hole, present) in enumerate(two.map(one, different)):
             results.append(measured)
+            holes.append(hole)
+            seen |= present
             if progress is not None:
                 progress("reading pairs", (number + 1) / len(different))
+    for entry, hole in zip(different, holes, strict=True):
+        if hole is not None and not seen[hole].any():
+            raise entry.error(
+                f"grey values {hole.start} to {hole.stop - 1} occur in none of the frames, those on both sides do: the "
+                "frames were changed after the ADC; capture RAW frames"
+            )
     result = dict(zip(different, results, strict=True))
     photons = [0.0 if not s.lit else np.nan if s.photons is None else s.photons for s in series]
     return levels([s.exposure_s for s in series], photons, [result[s] for s in series])
@@ -200,20 +209,34 @@ def _gaps(first: NDArray, second: NDArray, full: int) -> tuple[int, int]:
 
 
 def _gaps_of(frame: NDArray, full: int) -> tuple[int, int]:
-    """Those of one frame.
+    """Those of one frame. One gap alone lies between two groups of pixels, as those of two read-outs (or see `_hole`)."""
+    absent = _absent(frame, full)[1]
+    runs = int(np.sum(np.diff(absent.astype(np.int8)) == 1))
+    return int(absent.sum()) if runs > 1 else 0, absent.size
+
+
+def _hole(frame: NDArray, full: int) -> slice | None:
+    """Grey values of one gap near the mean, wider than the pixels' standard deviation; None without one."""
+    low, absent, spread = _absent(frame, full)
+    inside = np.flatnonzero(absent)
+    if inside.size <= spread or inside[-1] - inside[0] >= inside.size:
+        return None
+    return slice(int(low + inside[0]), int(low + inside[-1] + 1))
+
+
+def _absent(frame: NDArray, full: int) -> tuple[int, NDArray[np.bool_], float]:
+    """Lowest grey value near the mean, which of those from it on no pixel has, and the standard deviation.
 
     The range is that of the middle 87 % of the pixels: a few hot pixels, or masked ones, would widen a standard
-    deviation. One gap alone lies between two groups of pixels, as those of two read-outs.
+    deviation. Where few pixels are expected to have each value, it is empty.
     """
     counts = np.bincount(frame.ravel(), minlength=full + 1)
     below = np.cumsum(counts)
     low, high = (int(np.searchsorted(below, part * below[-1])) for part in _CENTRAL)
     spread = max((high - low) / _CENTRAL_SIGMAS, 0.5)
     if counts.sum() * 0.13 / spread < _EXPECTED:
-        return 0, 0
-    absent = counts[low : high + 1] == 0
-    runs = int(np.sum(np.diff(absent.astype(np.int8)) == 1))
-    return int(absent.sum()) if runs > 1 else 0, absent.size
+        high = low - 1
+    return low, counts[low : high + 1] == 0, spread
 
 
 class SpatialStack:
