@@ -321,6 +321,20 @@ def test_what_is_not_identifiable_says_why(tmp_path):
     assert "of both polarities" in still_target["theta_on"]["reason"]
 
 
+def test_a_target_without_a_steady_period_tells_no_thresholds():
+    """Random events, of which a third turns near the median; they gave 0.404 ± 0.005 at a contrast of 3."""
+    rng = np.random.default_rng(16)
+    one = tally(EventStream.of(random_events(rng, np.full(PIXELS, 40.0), 30.0, seconds=2.0, shape=SHAPE), SHAPE))
+    for key, entry in calibration.figures([one], one, None, 3.0, None).items():
+        if key.startswith("the") or key == "threshold_mismatch_rel":
+            assert "no steady period is seen" in entry["reason"]
+    assert calibration.figures([one], one, None, 3.0, 12.0)["theta_on"]["value"] is not None  # stated with --target-hz
+    one.turns_us = [np.append(np.full(60, 300), np.full(40, 900))]
+    assert one.period_s() is None
+    one.turns_us = [np.append(np.full(61, 300), np.full(39, 900))]
+    assert one.period_s() == pytest.approx(300e-6)
+
+
 def test_a_scene_that_is_not_still_is_a_finding(tmp_path):
     rng = np.random.default_rng(9)
     events = random_events(rng, np.full(PIXELS, 40.0), 0.0, seconds=1.0, shape=SHAPE)

@@ -209,7 +209,7 @@ def _gaps(first: NDArray, second: NDArray, full: int) -> tuple[int, int]:
 
 
 def _gaps_of(frame: NDArray, full: int) -> tuple[int, int]:
-    """Those of one frame. One gap alone lies between two groups of pixels, as those of two read-outs (or see `_hole`)."""
+    """Those of one frame. One gap alone may lie between two groups of pixels, as those of two read-outs."""
     absent = _absent(frame, full)[1]
     runs = int(np.sum(np.diff(absent.astype(np.int8)) == 1))
     return int(absent.sum()) if runs > 1 else 0, absent.size

@@ -22,8 +22,8 @@ WINDOW_US = 1000
 STEPS_PER_OCTAVE, STEPS = 32, 32 * 26
 #: Lamps on alternating current flicker with twice its frequency.
 LAMPS_HZ = (100.0, 120.0)
-#: Times between turns that are kept.
-TURNS = 200_000
+#: Times between turns that are kept, and part of them near their median where they are those of one period.
+TURNS, _ONE_PERIOD = 200_000, 0.6
 #: A recording needs this much time for figures of the scatter between its parts, µs.
 _LEAST_US = 10 * SLICES
 
@@ -157,12 +157,15 @@ class EventTally:
         self._turns += result.size
 
     def period_s(self) -> float | None:
-        """Time between two turns of a pixel from OFF to ON events, s; those that noise splits or joins are left out."""
+        """Time between two turns of a pixel from OFF to ON events, s; those that noise splits or joins are left out.
+
+        None where most are such: of random events, a third is within 30 % of the median.
+        """
         if not self._turns:
             return None
         every = np.concatenate(self.turns_us)
         near = np.abs(every / np.median(every) - 1) < 0.3
-        return float(every[near].mean()) / US_PER_S
+        return float(every[near].mean()) / US_PER_S if near.mean() > _ONE_PERIOD else None
 
     def _light(self, t_us: NDArray[np.int64], piece: NDArray[np.int64]) -> None:
         for k, hz in enumerate(LAMPS_HZ):

@@ -56,16 +56,20 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     if np.count_nonzero(seen) < 2 * GROUPS:
         return unknown(f"{np.count_nonzero(seen)} pixels have events of both polarities; {2 * GROUPS} are needed")
     period_s = 1 / cycles_hz if cycles_hz is not None else tally.period_s()
-    cycles = tally.seconds / period_s if period_s is not None else 0.0
+    if period_s is None:
+        return unknown(
+            "no steady period is seen in the times between a pixel's turns from OFF to ON events: no target passes, its "
+            "speed changes, or noise is too strong"
+        )
+    cycles = tally.seconds / period_s
     count = count[:, seen]
     means = count.mean(axis=1)
-    count = count / max(cycles, 1e-300)
+    count = count / cycles
     if cycles < _LEAST_CYCLES or count.mean(axis=1).min() < _LEAST_EVENTS:
         return unknown(
-            f"a pixel sees {cycles:.3g} cycles of the target, with {count.mean(axis=1).min() if cycles else 0:.3g} "
+            f"a pixel sees {cycles:.3g} cycles of the target, with {count.mean(axis=1).min():.3g} "
             f"events of a polarity in each; {_LEAST_CYCLES} cycles of {_LEAST_EVENTS} events are needed"
         )
-    assert period_s is not None
     ratio = max(means[0] - leak_hz * tally.seconds, 1.0) / means[1]
     course = _course(tally, leak_hz, period_s, ratio)
     unsure = course.unsure * np.array([1.0, 1 / ratio]) / count.mean(axis=1)
