@@ -58,8 +58,8 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     period_s = 1 / cycles_hz if cycles_hz is not None else tally.period_s()
     if period_s is None:
         return unknown(
-            "no steady period is seen in the times between a pixel's turns from OFF to ON events: no target passes, its "
-            "speed changes, or noise is too strong"
+            "no steady period is seen in the times between a pixel's turns from OFF to ON events: no target passes, "
+            "its speed changes, or noise is too strong"
         )
     cycles = tally.seconds / period_s
     count = count[:, seen]
