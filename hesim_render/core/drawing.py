@@ -118,7 +118,7 @@ def picture(title: str, values: NDArray, unit: str, size_px: int = 400) -> Marku
     rows, columns = values.shape
     scale = size_px / max(rows, columns)
     width, height = max(24, round(scale * columns)), max(24, round(scale * rows))
-    figure = new_figure((width + 96, height + 26))
+    figure = new_figure((width + 108, height + 26))
     axes = figure.subplots()
     shades = colormaps["cividis"].with_extremes(bad="#c8c8c8")
     image = axes.imshow(np.ma.masked_invalid(values), cmap=shades, vmin=low, vmax=high)

@@ -8,6 +8,7 @@ from scipy import stats
 
 from hesim_render.calibrate.estimate import estimated
 from hesim_render.calibrate.recordings import short_intervals, still, target
+from hesim_render.calibrate.recordings import tally as recording_tally
 from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import readout_limit
 from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, SLICES, EventTally, tally
@@ -26,7 +27,8 @@ def events_of(rng, count=3000, begin_us=700):
     return events
 
 
-def test_a_tally_is_what_a_loop_over_events_counts():
+def test_a_tally_is_what_a_loop_over_events_counts(monkeypatch):
+    monkeypatch.setattr(recording_tally, "_ONE_PERIOD", 0.1)  # random events have no period
     events = events_of(np.random.default_rng(1))
     found = EventTally("x", SHAPE, 700, 60_700)
     for block in np.array_split(events, 7):
