@@ -225,6 +225,16 @@ def test_readout_limit_and_saturated_recordings(tmp_path):
     assert "at least" in readout_limit([free])[0]["reason"]
 
 
+@pytest.mark.parametrize("most", (1, 2, 3, 5))
+def test_windows_of_a_few_events_are_no_readout_limit(most):
+    """Still pixels in dim light have an event now and then; such recordings were refused as saturated."""
+    windows = np.array([0, 300, 40, 9, 30, 25])[: most + 1]
+    found, saturated = readout_limit([SimpleNamespace(windows=windows, pixels=1120)])
+    assert f"at least {most},000 events/s" in found["reason"] and saturated == []
+    full = np.append(np.zeros(6, int), 25)
+    assert readout_limit([SimpleNamespace(windows=full, pixels=1120)])[0]["value"] == 6000
+
+
 def test_windows_with_the_same_events_of_every_pixel_are_no_readout_limit():
     """The pixels fire twice in each of 40 windows: more of them would give more."""
     events = np.zeros(80 * PIXELS, EVENT_DTYPE)

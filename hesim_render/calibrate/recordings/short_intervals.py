@@ -97,7 +97,8 @@ def readout_limit(tallies: Sequence[EventTally]) -> tuple[dict[str, Any], list[E
     full, below = every[most - slack :], every[max(most - 2 * slack - 1, 0) : most - slack]
     rate = US_PER_S / WINDOW_US
     least = f"{float(f'{most * rate:.4g}'):,.0f}"
-    if full.sum() < _LEAST_WINDOWS or full.sum() < 5 * below.sum():
+    # windows of a few events have no less full ones beside them to compare with
+    if most <= 2 * slack + 1 or full.sum() < _LEAST_WINDOWS or full.sum() < 5 * below.sum():
         return not_identifiable(f"no two of the fullest windows are equally full; it is at least {least} events/s"), []
     each = most / tallies[0].pixels
     if 0 <= np.ceil(each) - each <= _SILENT * np.ceil(each):
