@@ -113,7 +113,7 @@ def aps(
         with console.progress("calibrate aps") as move:
             calibrate_aps(captures, out, report, move.part, overwrite=overwrite)
     else:
-        if not is_pair_set(captures):
+        if captures.exists() and not is_pair_set(captures):
             raise RangeError("--sensor-file", str(sensor_file), "none: captures of EMVA 1288 alone tell a whole sensor")
         free_place(sensor_file, overwrite)
         from hesim_render.calibrate.aps.pairs_output import calibrate_pairs
