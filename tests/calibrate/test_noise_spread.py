@@ -120,9 +120,10 @@ def test_what_is_not_identifiable_says_why():
     assert "2.2 ON events for an OFF event" in leaking["odd_cols_rel"]["reason"]
     few = noise_spread(made_tally([[even, even], [0.12 * even, 0.12 * even]]))
     assert "4.8 events of a polarity in half of the time; 5 are needed" in few["bandwidth_rel"]["reason"]
-    small = made_tally(np.full((2, 2, 12), 40.0))
-    small.shape = (3, 4)
-    assert "12 pixels are too few" in noise_spread(small)["bandwidth_rel"]["reason"]
+    for shape in ((3, 4), (1, 400)):
+        small = made_tally(np.full((2, 2, shape[0] * shape[1]), 40.0))
+        small.shape = shape
+        assert "too few pixels" in noise_spread(small)["bandwidth_rel"]["reason"]
     assert "rate of every recording changes" in surest([])["odd_rows_rel"]["reason"]
 
 

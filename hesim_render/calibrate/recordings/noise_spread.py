@@ -49,7 +49,7 @@ def noise_spread(tally: EventTally) -> dict[str, dict[str, Any]]:
     counts = tally.counts.reshape(4, -1).astype(np.float64)
     means = counts[:, tally.used].mean(axis=1)
     on, off = means[:2].sum(), means[2:].sum()
-    if min(tally.shape) < 2 or means.min() < _EVENTS_OF_HALF:
+    if means.min() < _EVENTS_OF_HALF:
         return _none(f"a pixel has {means.min():.2g} events of a polarity in half of the time; {_EVENTS_OF_HALF:g} are "
                      "needed: record longer, in dimmer light")  # fmt: skip
     if not 1 / _MOST_RATIO < on / off < _MOST_RATIO:
@@ -58,7 +58,7 @@ def noise_spread(tally: EventTally) -> dict[str, dict[str, Any]]:
     sums = _sums(tally, counts)
     every = np.concatenate([sums.sum(axis=2, keepdims=True), sums.sum(axis=2, keepdims=True) - sums], axis=2)
     if every[0].min() < 2:
-        return _none(f"{tally.pixels} pixels are too few")
+        return _none("even or odd rows or columns have too few pixels")
     gaps = tally.gaps.sum(axis=0)
     gaps = np.concatenate([gaps.sum(axis=0, keepdims=True), gaps.sum(axis=0) - gaps])
     turn_s = np.array([quantile_us(one, 0.25) for one in gaps]) * S_PER_US
