@@ -218,6 +218,16 @@ def test_pixels_that_know_nothing_of_one_another_have_no_correlation():
     assert np.all(np.abs(found) < 4 * 0.0013 / np.sqrt(12))
 
 
+@pytest.mark.parametrize("part", (0, 19))
+def test_each_part_is_drawn(part):
+    """All but a few events are in one part, two of three ON: a draw has it, or not, and then as many of both."""
+    one = poisson(33)
+    one.polarity[:] = 1
+    one.polarity[part] = 4000, 2000
+    found = {d.name: d for d in event_distances(one, poisson(34))}["polarity"]
+    assert found.within == pytest.approx(1.0955 / 3, rel=0.02)
+
+
 def test_one_burst_in_thousands_is_no_difference():
     """None in the first stream of 54,000, one in the second, in 18,000: any draw of the first has none."""
     one, other = poisson(31), poisson(32)
