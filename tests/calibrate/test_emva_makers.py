@@ -481,3 +481,10 @@ def test_a_plain_folder_may_hold_other_pictures(taken, expected, tmp_path, form,
             emva_makers.save(folder / f"{light}_{number:02}{suffix}", frame, form, camera.bits)
     (folder / "capture.yaml").write_text(f"bit_depth: {camera.bits}\ntile_rows: 1\ntile_cols: 1\n", "utf-8")
     assert figures(folder)["K"]["value"] == pytest.approx(expected[width][1]["K"]["value"], rel=1e-9)
+
+
+def test_a_frame_of_a_plain_folder_without_its_second_is_named(tmp_path):
+    emva_makers.save(tmp_path / "dark_400us_00.pgm", np.full((4, 6), 90, np.uint16), "pgm", 12)
+    (tmp_path / "capture.yaml").write_text("bit_depth: 12\ntile_rows: 1\ntile_cols: 1\n", "utf-8")
+    with pytest.raises(SpecError, match="1 frame; a pair has two"):
+        read_pair_set(tmp_path)
