@@ -232,6 +232,20 @@ def test_the_widths_of_an_s_curve_and_their_errors_are_those_of_the_logarithms(m
         assert entries["threshold"]["standard_error"] == pytest.approx(np.sqrt(covariance[0, 0]))
 
 
+@pytest.mark.parametrize(("sign", "part"), [(1, 1), (-1, 2)])
+def test_a_width_that_does_not_show_is_at_most_what_is_a_quarter_as_likely(sign, part):
+    """ln σ/τ goes in steps of 0.1 until the likelihood is below 0.26 of its maximum; its law is normal, or even."""
+    values = np.array([0.21, np.log(0.05), np.log(0.7), special.logit(0.03)])
+    slope, unsure = np.array([0.0, 1.0, 0.4 * sign, 0.0]), np.diag([0.0, 4.0, 1.0, 0.0])
+    own = s_curves._natural(values)[part]
+    for deviation, farthest in ((0.8, 1.4), (np.inf, 8 - sign * np.log(0.7))):
+        fit = SimpleNamespace(total=lambda v, deviation=deviation: -0.5 * ((v[2] - values[2]) / deviation) ** 2)
+        found = s_curves._part(fit, values, unsure, slope, own, "1")
+        there = 0.7 * np.exp(sign * farthest)
+        expected = 0.05 * (there if sign > 0 else 1) / np.hypot(1, there)
+        assert found["value"] == 0 and found["upper_limit"] == pytest.approx(expected, rel=1e-3)
+
+
 def test_ends_of_the_range_are_as_sure_as_the_fewest_answers(monkeypatch):
     """Steps times pixels of the light that has the fewest of them decides how near to 1 a share can be known."""
     counts = []
