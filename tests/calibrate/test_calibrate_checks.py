@@ -256,7 +256,7 @@ def test_a_floor_is_what_steps_of_the_other_direction_give_beyond_leak(on, off, 
     values = {"ON": on, "OFF": off}
     assert " and ".join(f"{values[name]:.2g} ({name})" for name in named) in found.text
     away = {"ON": abs(on - 0.003) / np.hypot(0.001, 0.0004), "OFF": abs(off) / 0.001}
-    assert found.p_value == pytest.approx(min(4 * norm.sf(away[name]) for name in named), rel=1e-6)
+    assert found.p_value == pytest.approx(min(4 * norm.sf(away[name]) for name in named), rel=1e-6, abs=0)
 
 
 def test_searches_that_end_elsewhere_are_told(good_events):
