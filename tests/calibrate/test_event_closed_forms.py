@@ -10,6 +10,7 @@ from scipy.stats import norm
 from hesim_render.calibrate.asynchronous import fit as trials_fit
 from hesim_render.calibrate.asynchronous import likelihood
 from hesim_render.calibrate.evs import analysis, dispersion, thresholds
+from hesim_render.calibrate.evs import fit as events_fit
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_probability
 
@@ -280,3 +281,27 @@ def test_grids_of_thresholds_reach_six_spreads_on_both_sides(mismatch, reach):
     grid = likelihood.threshold_grid(0.4, mismatch)
     assert grid.size == 97 and (grid[0], grid[-1]) == pytest.approx((0.4 * reach[0], 0.4 * reach[1]))
     np.testing.assert_allclose(np.diff(grid), 0.4 * (reach[1] - reach[0]) / 96)
+
+
+@pytest.mark.parametrize("law", ["linear", "sqrt"])
+def test_the_approach_finds_the_parameters_of_rates_without_noise(law):
+    """A, B and C of u = Θ (A y + B) / √(2 (1 + 2 e r + (w + e²) r²)) with r = y or √y, from starts far off in all."""
+    rng, y = np.random.default_rng(8), np.linspace(5.0, 600.0, 40)
+    a, b, w, e, theta = 0.01, 1.5, 0.02, 0.05, 1.6
+    r = y if law == "linear" else np.sqrt(y)
+    if law == "linear":
+        w, e = w / 900, e / 30
+    u = theta * (a * y + b) / np.sqrt(2 * (1 + 2 * e * r + (w + e * e) * r * r))
+    relative, spread = rng.uniform(0.8, 1.2, 40), rng.uniform(0.02, 0.06, 40)
+    v = u * relative / np.sqrt(1 + (u * spread) ** 2)
+    pixels = rng.integers(50, 4000, 40).astype(float)
+    events = norm.sf(v) * (pixels * 700 + 1) - 0.5
+    cells = Cells(y, np.ones(40), relative, spread, pixels, events, 700)
+    off = np.exp([[-0.75], [1.5]])  # of C, among the factors that are tried
+    start = np.array([[9.0, -2.0, w, e, 0.1, 0.02], [1e-4, 3.0, w, e, 0.1, 0.02]])
+    start[:, 2:3] *= off**2
+    start[:, 3:4] *= off
+    found = events_fit._approach(cells, start, theta, law, [True] * 4)
+    np.testing.assert_allclose(found[:, :4], np.tile([a, np.log(b), w, e], (2, 1)), rtol=1e-6)
+    np.testing.assert_array_equal(found[:, 4:], start[:, 4:])
+    np.testing.assert_array_equal(events_fit._approach(cells, start, theta, law, [True, True, False, True]), start)
