@@ -183,3 +183,16 @@ def test_what_counts_as_a_mirror(walls, images):
         shapes[f"wall{number}"] = wall
     scene = mi.load_dict({"type": "scene", "lamp": lamp, **shapes}, optimize=False)
     assert len(LampImages.of(mi, scene)) == images
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_mirror_of_two_sides_reflects_on_that_of_the_lamp(side):
+    """However it is turned: points on the lamp's side see the image, points behind the mirror do not."""
+    mi = mitsuba()
+    wall = mirror({"type": "twosided", "nested": MIRROR}, side=side)
+    wall["to_world"] = mi.ScalarTransform4f(wall["to_world"])
+    lamp = {"type": "rectangle", "to_world": mi.ScalarTransform4f(placed(LAMP)), "emitter": {"type": "area"}}
+    images = LampImages.of(mi, mi.load_dict({"type": "scene", "lamp": lamp, "wall": wall}, optimize=False))
+    points = mi.Point3f(np.array([[WALL_X - 0.3, 0.1, 0.0], [WALL_X + 0.3, 0.1, 0.0]]).T.astype(np.float32))
+    cones = images.seen_from(points, mi.Vector3f(0, 0, 1), mi.Mask(True))
+    assert np.array(cones.chance)[0] > 0 == np.array(cones.chance)[1]
