@@ -160,12 +160,20 @@ def test_events_where_there_can_be_none_are_counted_in_those_trials_alone(monkey
     )  # fmt: skip
     steady = replace(steps, signal_dn=np.array([100.0]), contrast=np.zeros(1), calm=np.full((1, 3), 400), on=0 * on[:1])
     steady = replace(steady, off=steady.on)
-    monkeypatch.setattr(defects, "chances", lambda _, trials, *__: chance[: len(trials.contrast), None])
-    likelihood = SimpleNamespace(grids=[np.array([0.2, 0.3])] * 2)
+    grids = {1: np.array([0.2, 0.3]), -1: np.array([0.27, 0.38])}
+
+    def chances(values, trials, polarity, grid, law):
+        assert grid is grids[polarity]
+        return chance[: len(trials.contrast), None]
+
+    monkeypatch.setattr(defects, "chances", chances)
+    likelihood = SimpleNamespace(grids=list(grids.values()))
     given = np.full((3, 2), 0.5)
     fit = SimpleNamespace(values=np.zeros(12), law="sqrt", likelihood=likelihood, law_given=lambda counts: given)
-    found = defects._tests(fit, steady, steps, 1)
-    assert found.tolist() == [[False] * 3, [False, False, True], [False, True, False]]
+    for polarity in (1, -1):
+        found = defects._tests(fit, steady, steps, polarity)
+        assert found.tolist() == [[False] * 3, [False, False, True], [False, True, False]]
+        steps = replace(steps, contrast=-steps.contrast, on=steps.off, off=steps.on)
 
 
 def test_report_shows_curves_rates_and_maps(plain):
