@@ -151,6 +151,9 @@ def test_directions_are_drawn_with_their_density():
         assert below.min() > -1e-6
         assert below.max() < width + 1e-6
         assert abs(below.mean() - width / 2) < 5 * width / (12 * own.sum()) ** 0.5
+        # all around the axis: sin² is 2 · below, half of it in each direction across
+        across = direction[own] - (direction[own] @ axis)[:, None] * axis
+        assert np.abs(across.mean(axis=0)).max() < 5 * (width / 2 / own.sum()) ** 0.5
     # over the whole sphere the density makes up the chance of being drawn
     z, turn = rng.uniform(-1, 1, count), rng.uniform(0, 2 * np.pi, count)
     around = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
