@@ -144,7 +144,6 @@ def _efnet(clip: _Clip, split: str, root: Path) -> int:
         return 0
     path = root / ("train" if split == "train" else "test") / f"{clip.name}.h5"
     path.parent.mkdir(parents=True, exist_ok=True)
-    rows, cols = clip.shape
     sharp = clip.clip.sharp
     assert sharp is not None
     with h5py.File(path, "w") as file:
@@ -154,21 +153,18 @@ def _efnet(clip: _Clip, split: str, root: Path) -> int:
             file.create_dataset(f"events/{name}", data=np.asarray(values).astype(kind))
         for number, (frame, nearest) in enumerate(pairs):
             end = frame.exposure_start_us + frame.exposure_us
-            attributes = {
-                "size": (rows, cols, 3), "timestamp": end / 1e6, "event_idx": int(np.searchsorted(when, end, "right")),
-            }  # fmt: skip
+            attributes = {"timestamp": end / 1e6, "event_idx": int(np.searchsorted(when, end, "right"))}
             images: dict[str, Any] = {
                 "sharp_images/image": clip.picture(sharp.raw_dn(nearest)),
                 "images/image": clip.picture(frame.raw),
                 "voxels/voxel": _voxels(clip, frame),
-                "masks/mask": np.zeros((rows, cols), np.uint8),
+                "masks/mask": np.zeros(clip.shape, np.uint8),
             }
             for name, values in images.items():
                 entry = file.create_dataset(f"{name}{number:09d}", data=values)
                 entry.attrs.update({**attributes, "size": values.shape})
         file.attrs.update({
-            "sensor_resolution": (rows, cols), "num_events": len(when), "num_imgs": len(pairs),
-            "source": "hesim_render",
+            "sensor_resolution": clip.shape, "num_events": len(when), "num_imgs": len(pairs), "source": "hesim_render",
         })  # fmt: skip
     return len(pairs)
 

@@ -65,6 +65,20 @@ def test_every_task_has_scores(built, tmp_path):
     assert losers and stored["verdicts"] == result["verdicts"]
 
 
+@pytest.mark.parametrize("bright", [0.0, 0.37])
+def test_grey_pairs_have_the_exposure_of_the_first_picture(bright):
+    """Of colours 0.2126, 0.7152, 0.0722; the brightest half percent of the first becomes 0.95, black stays black."""
+    colours = np.random.default_rng(3).random((2, 20, 30, 3)).astype(np.float32) * np.float32(bright)
+    luma = colours.astype(np.float64) @ [0.2126, 0.7152, 0.0722]
+    gain = 0.95 / np.percentile(luma[0], 99.5) if bright else 1.0
+    light = np.clip(luma * gain, 0, 1)
+    wanted = 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+    made = ClipDevelopment(None)
+    made.linear = lambda raw: colours[raw]
+    for found, expected in zip(made.grey_pair(0, 1), wanted, strict=True):
+        assert found.dtype == np.uint8 and np.abs(found - expected).max() < 0.51
+
+
 def test_a_method_that_loses_to_doing_nothing_is_named_with_the_reason():
     def of(task, method, measure, *values):
         return [Score(f"c{k % 2}", task, method, k, {measure: value}) for k, value in enumerate(values)]

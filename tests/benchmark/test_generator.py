@@ -10,7 +10,7 @@ from PIL import Image
 
 from benchmarks import generated, small
 from hesim_render.benchmark.draws import draws, shares
-from hesim_render.benchmark.generator import Generator
+from hesim_render.benchmark.generator import Generator, _into_cube
 from hesim_render.benchmark.materials import KINDS, texture
 from hesim_render.benchmark.meshes import mesh
 from hesim_render.benchmark.plan import BenchmarkPlan, shared_parts
@@ -226,6 +226,16 @@ def test_meshes_are_closed_and_fill_the_cube():
         edges = Counter(tuple(e) for f in faces for e in ((f[0], f[1]), (f[1], f[2]), (f[2], f[0])))
         # every edge is walked once in each direction: closed, and all faces look to the same side
         assert all(edges[b, a] == count == 1 for (a, b), count in edges.items())
+
+
+def test_meshes_of_files_are_moved_and_scaled_alike_in_all_directions(tmp_path):
+    """Corners of a box of 4 x 6 x 40 about (3, 5, 10): its longest side becomes 1."""
+    corners = np.array(list(itertools.product((1, 5), (2, 8), (-10, 30))), dtype=float)
+    lines = ["o box", *(f"v {x} {y} {z}" for x, y, z in corners), "vn 0 0 90", "f 1 2 3"]
+    (tmp_path / "box.obj").write_text("\n".join(lines))
+    matrix = _into_cube(tmp_path / "box.obj")
+    placed = corners @ matrix[:3, :3].T + matrix[:3, 3]
+    np.testing.assert_allclose(placed, (corners - [3, 5, 10]) / 40, atol=1e-12)
 
 
 def test_shares_give_each_item_to_one_split():

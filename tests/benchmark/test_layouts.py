@@ -98,6 +98,8 @@ def test_efnet_has_images_voxels_and_events(built, clip, tmp_path):
             key = f"{number:09d}"
             voxel = file[f"voxels/voxel{key}"]
             assert voxel.shape == (6, 16, 24) and voxel.dtype == np.float32
+            mask = file[f"masks/mask{key}"]
+            assert tuple(mask.attrs["size"]) == mask.shape == (16, 24) and tuple(voxel.attrs["size"]) == voxel.shape
             assert file[f"images/image{key}"].shape == file[f"sharp_images/image{key}"].shape == (16, 24, 3)
             end = frame.exposure_start_us + frame.exposure_us
             middle = end - frame.exposure_us // 2

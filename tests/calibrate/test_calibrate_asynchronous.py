@@ -15,7 +15,7 @@ import hesim_render as hr
 from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
 from hesim_render.calibrate.asynchronous import checks, defects
 from hesim_render.calibrate.asynchronous.defects import classify, plainly_bad
-from hesim_render.calibrate.asynchronous.likelihood import first_event
+from hesim_render.calibrate.asynchronous.likelihood import first_event, log_prior
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials, read_trials
 from hesim_render.calibration.spec import Defect
 from hesim_render.capture.lab import write_captures
@@ -160,12 +160,20 @@ def test_events_where_there_can_be_none_are_counted_in_those_trials_alone(monkey
     )  # fmt: skip
     steady = replace(steps, signal_dn=np.array([100.0]), contrast=np.zeros(1), calm=np.full((1, 3), 400), on=0 * on[:1])
     steady = replace(steady, off=steady.on)
-    monkeypatch.setattr(defects, "chances", lambda _, trials, *__: chance[: len(trials.contrast), None])
-    likelihood = SimpleNamespace(grids=[np.array([0.2, 0.3])] * 2)
+    grids = {1: np.array([0.2, 0.3]), -1: np.array([0.27, 0.38])}
+
+    def chances(values, trials, polarity, grid, law):
+        assert grid is grids[polarity]
+        return chance[: len(trials.contrast), None]
+
+    monkeypatch.setattr(defects, "chances", chances)
+    likelihood = SimpleNamespace(grids=list(grids.values()))
     given = np.full((3, 2), 0.5)
     fit = SimpleNamespace(values=np.zeros(12), law="sqrt", likelihood=likelihood, law_given=lambda counts: given)
-    found = defects._tests(fit, steady, steps, 1)
-    assert found.tolist() == [[False] * 3, [False, False, True], [False, True, False]]
+    for polarity in (1, -1):
+        found = defects._tests(fit, steady, steps, polarity)
+        assert found.tolist() == [[False] * 3, [False, False, True], [False, True, False]]
+        steps = replace(steps, contrast=-steps.contrast, on=steps.off, off=steps.on)
 
 
 def test_report_shows_curves_rates_and_maps(plain):
@@ -598,7 +606,22 @@ def test_a_family_of_columns_is_judged_by_the_law_of_hotelling(count):
     t2 *= count**2 / (count**2 - 1)
     assert (found.chi2, found.dof) == (pytest.approx(t2, rel=1e-6), 3)
     chance = f_law.sf(t2 * (count - 3) / (3 * (count - 1)), 3, count - 3)
-    assert found.p_value == pytest.approx(chance, rel=1e-5)
+    assert found.p_value == pytest.approx(chance, rel=1e-5, abs=0)
+
+
+def test_a_family_is_told_below_the_chance_of_an_alarm_and_names_its_check():
+    for name, check in (("steps", "S-curve"), ("times", "event times"), ("steady", "noise rate")):
+        assert checks._family(name, checks.TrialGoodness(90.0, 40, 1.01e-4)) is None
+        found = checks._family(name, checks.TrialGoodness(90.0, 40, 0.99e-4))
+        assert (found.check, found.p_value) == (check, 0.99e-4) and found.text.startswith("χ²/dof 2.25: ")
+
+
+def test_the_prior_of_thresholds_is_a_normal_law_never_narrower_than_the_grid():
+    grid = np.arange(0.14, 0.31, 0.01)
+    for mismatch in (0.001, 0.15):
+        width = np.hypot(mismatch * 0.21, 0.01)
+        expected = np.exp(-0.5 * ((grid - 0.21) / width) ** 2)
+        np.testing.assert_allclose(np.exp(log_prior(0.21, mismatch, grid)), expected / expected.sum(), rtol=1e-9)
 
 
 def test_each_family_of_columns_is_judged_by_itself_and_all_together(monkeypatch):

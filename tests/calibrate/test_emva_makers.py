@@ -288,23 +288,23 @@ def test_a_long_series_at_the_full_well_is_refused(taken, tmp_path):
 
 
 def mosaic(series, rng):
-    """Frames of a mosaic of 2x2 whose place (1, 0) holds a series; the others have other lights."""
+    """Frames of a mosaic of 2 rows and 3 columns whose place (1, 2) holds a series; the others have other lights."""
     outcome = []
     for lit, us, photons, frames in series:
         count, rows, cols = frames.shape
-        whole = rng.integers(60, 900, (count, 2 * rows, 2 * cols), np.uint16)
-        whole[:, 1::2, ::2] = frames
+        whole = rng.integers(60, 900, (count, 2 * rows, 3 * cols), np.uint16)
+        whole[:, 1::2, 2::3] = frames
         outcome.append((lit, us, photons, whole))
     return outcome
 
 
 def test_a_mosaic_is_refused_or_evaluated_at_one_place(taken, expected, tmp_path):
     listed = mosaic(taken["wide"], np.random.default_rng(2))
-    text = "bit_depth: 12\ntile_rows: 2\ntile_cols: 2\n"
-    folder = Maker(capture=text).write(tmp_path / "set", listed, 12, (84, 116))
+    text = "bit_depth: 12\ntile_rows: 2\ntile_cols: 3\n"
+    folder = Maker(capture=text).write(tmp_path / "set", listed, 12, (84, 174))
     with pytest.raises(SpecError, match=r"capture.yaml: EMVA 1288 evaluates one colour at a time: state tile_position"):
         read_pair_set(folder)
-    (folder / "capture.yaml").write_text(text + "tile_position: [1, 0]\n", encoding="utf-8")
+    (folder / "capture.yaml").write_text(text + "tile_position: [1, 2]\n", encoding="utf-8")
     found = figures(folder)
     assert found["K"] == expected["wide"][1]["K"] and found["prnu_percent"] == expected["wide"][1]["prnu_percent"]
     # the file is of the pixels of this place, without a tile
@@ -313,6 +313,9 @@ def test_a_mosaic_is_refused_or_evaluated_at_one_place(taken, expected, tmp_path
     assert (capture["tile_rows"], capture["tile_cols"]) == (1, 1) and "tile_position" not in capture
     (folder / "capture.yaml").write_text(text + "tile_position: [2, 0]\n", encoding="utf-8")
     with pytest.raises(SpecError, match=r"tile_position \[2, 0\] lies outside of the tile"):
+        read_pair_set(folder)
+    (folder / "capture.yaml").write_text("bit_depth: 12\ntile_rows: 3\ntile_cols: 4\ntile_position: [1, 2]\n", "utf-8")
+    with pytest.raises(SpecError, match="frames of 174x84 px do not hold whole tiles of 4x3"):
         read_pair_set(folder)
 
 
@@ -478,3 +481,10 @@ def test_a_plain_folder_may_hold_other_pictures(taken, expected, tmp_path, form,
             emva_makers.save(folder / f"{light}_{number:02}{suffix}", frame, form, camera.bits)
     (folder / "capture.yaml").write_text(f"bit_depth: {camera.bits}\ntile_rows: 1\ntile_cols: 1\n", "utf-8")
     assert figures(folder)["K"]["value"] == pytest.approx(expected[width][1]["K"]["value"], rel=1e-9)
+
+
+def test_a_frame_of_a_plain_folder_without_its_second_is_named(tmp_path):
+    emva_makers.save(tmp_path / "dark_400us_00.pgm", np.full((4, 6), 90, np.uint16), "pgm", 12)
+    (tmp_path / "capture.yaml").write_text("bit_depth: 12\ntile_rows: 1\ntile_cols: 1\n", "utf-8")
+    with pytest.raises(SpecError, match="1 frame; a pair has two"):
+        read_pair_set(tmp_path)

@@ -7,9 +7,11 @@ import pytest
 from scipy.special import ndtr
 from scipy.stats import norm
 
+from hesim_render.calibrate.asynchronous import analysis as trials_analysis
 from hesim_render.calibrate.asynchronous import fit as trials_fit
 from hesim_render.calibrate.asynchronous import likelihood
 from hesim_render.calibrate.evs import analysis, dispersion, thresholds
+from hesim_render.calibrate.evs import fit as events_fit
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_probability
 
@@ -280,3 +282,71 @@ def test_grids_of_thresholds_reach_six_spreads_on_both_sides(mismatch, reach):
     grid = likelihood.threshold_grid(0.4, mismatch)
     assert grid.size == 97 and (grid[0], grid[-1]) == pytest.approx((0.4 * reach[0], 0.4 * reach[1]))
     np.testing.assert_allclose(np.diff(grid), 0.4 * (reach[1] - reach[0]) / 96)
+
+
+@pytest.mark.parametrize("law", ["linear", "sqrt"])
+def test_the_approach_finds_the_parameters_of_rates_without_noise(law):
+    """A, B and C of u = Θ (A y + B) / √(2 (1 + 2 e r + (w + e²) r²)) with r = y or √y, from starts far off in all."""
+    rng, y = np.random.default_rng(8), np.linspace(5.0, 600.0, 40)
+    a, b, w, e, theta = 0.01, 1.5, 0.02, 0.05, 1.6
+    r = y if law == "linear" else np.sqrt(y)
+    if law == "linear":
+        w, e = w / 900, e / 30
+    u = theta * (a * y + b) / np.sqrt(2 * (1 + 2 * e * r + (w + e * e) * r * r))
+    relative, spread = rng.uniform(0.8, 1.2, 40), rng.uniform(0.02, 0.06, 40)
+    v = u * relative / np.sqrt(1 + (u * spread) ** 2)
+    pixels = rng.integers(50, 4000, 40).astype(float)
+    events = norm.sf(v) * (pixels * 700 + 1) - 0.5
+    cells = Cells(y, np.ones(40), relative, spread, pixels, events, 700)
+    off = np.exp([[-0.75], [1.5]])  # of C, among the factors that are tried
+    start = np.array([[9.0, -2.0, w, e, 0.1, 0.02], [1e-4, 3.0, w, e, 0.1, 0.02]])
+    start[:, 2:3] *= off**2
+    start[:, 3:4] *= off
+    found = events_fit._approach(cells, start, theta, law, [True] * 4)
+    np.testing.assert_allclose(found[:, :4], np.tile([a, np.log(b), w, e], (2, 1)), rtol=1e-6)
+    np.testing.assert_array_equal(found[:, 4:], start[:, 4:])
+    np.testing.assert_array_equal(events_fit._approach(cells, start, theta, law, [True, True, False, True]), start)
+
+
+@pytest.mark.parametrize("polarity", [1.0, -1.0])
+def test_totals_of_pixels_have_the_threshold_and_mismatch_of_their_polarity(polarity):
+    result = SimpleNamespace(
+        theta_on=0.21, theta_off=0.33, mismatch_on=0.06, mismatch_off=0.12, width=0.06, slope=0.1, step=STEP
+    )
+    theta, m = (0.21, 0.06) if polarity > 0 else (0.33, 0.12)
+    relative = np.array([0.8, 1.0, 1.3])
+    noise = np.sqrt(0.06**2 - (m * theta) ** 2) * np.maximum(1 + 0.1 * STEP / theta, 0.2)
+    wanted = 250 * norm.sf((theta * relative[:, None] - polarity * STEP) / noise).sum(axis=1)
+    np.testing.assert_allclose(thresholds.totals_of(result, polarity, relative, 250), wanted, rtol=1e-6)
+
+
+def test_each_polarity_of_a_trial_has_its_own_threshold_leak_and_grid(monkeypatch):
+    """Thresholds 0.2 and 0.31; leak makes ON events alone. Of a pixel the mean over its own grid counts."""
+    values = np.full(len(likelihood.NAMES), 0.5)
+    values[likelihood.THETA[0]], values[likelihood.THETA[1]], values[likelihood.LEAK] = 0.2, 0.31, 0.04
+    seen = []
+
+    def first_event(own, other, *given):
+        seen.append((own.ravel().tolist(), other, given[-1]))
+        return np.zeros((1, 2, 3)), np.zeros((1, 2, 3))
+
+    monkeypatch.setattr(likelihood, "first_event", first_event)
+    trials = SimpleNamespace(
+        signal_dn=np.array([9.0, 20.0]), contrast=np.array([0.1, 0.3]), settle_s=0.01, edges_s=np.array([0.0, 0.1])
+    )
+    grids = [np.array([0.15, 0.2, 0.25]), np.array([0.2, 0.31, 0.5])]
+    for k, polarity in enumerate((1, -1)):
+        likelihood.chances(values, trials, polarity, grids[k], "sqrt")
+    assert seen == [(grids[0].tolist(), 0.31, (0.04, 0.0)), (grids[1].tolist(), 0.2, (0.0, 0.04))]
+    weight = np.array([[0.2, 0.5, 0.3], [0.0, 0.9, 0.1]])
+    monkeypatch.setattr(trials_analysis, "TrialCounts", SimpleNamespace(of=lambda sets, polarity: polarity))
+    some = SimpleNamespace(calm=np.zeros((2, 2)), of=lambda which: which)
+    fit = SimpleNamespace(
+        values=values, likelihood=SimpleNamespace(grids=grids), law_given=lambda polarity: weight[::polarity]
+    )
+    for k, polarity in enumerate((1, -1)):
+        relative = grids[k] / (0.2, 0.31)[k]
+        mean, spread = trials_analysis._pixel_thresholds(fit, some, some, polarity)
+        np.testing.assert_allclose(mean, weight[::polarity] @ relative, rtol=1e-6)
+        wanted = np.sqrt(weight[::polarity] @ relative**2 - (weight[::polarity] @ relative) ** 2)
+        np.testing.assert_allclose(spread, wanted, rtol=1e-4)

@@ -233,4 +233,4 @@ def test_a_ceiling_below_1_is_told_beyond_its_error(value, error, is_told):
     found = checks._ceiling(SimpleNamespace(ceiling=(value, error)))
     assert (found is not None) is is_told
     if is_told:
-        assert found.p_value == pytest.approx(norm.sf(0.02 / error))
+        assert found.p_value == pytest.approx(norm.sf(0.02 / error), rel=1e-6, abs=0)

@@ -279,12 +279,12 @@ def test_events_away_from_the_threshold_are_told_beyond_leak():
     off[0, 0, :50] = 1
     told = found()
     assert "0.001 (OFF) of the trials" in told.text
-    assert told.p_value == pytest.approx(2 * poisson.sf(49, 0.5))
+    assert told.p_value == pytest.approx(2 * poisson.sf(49, 0.5), rel=1e-6, abs=0)
     on[2, 1] = 2
     told = found()
     assert "0.014 (ON) and 0.001 (OFF)" in told.text
     off[0, 0] = 0
-    assert found().p_value == pytest.approx(2 * poisson.sf(699, usual + 0.5))
+    assert found().p_value == pytest.approx(2 * poisson.sf(699, usual + 0.5), rel=1e-6, abs=0)
 
 
 @pytest.mark.parametrize(("on", "off"), [(0.071, 0.052), (0.006, 0.004)])

@@ -27,6 +27,8 @@ def test_trails_and_densities_are_drawn_side_by_side(has_events, tmp_path, monke
     assert (tmp_path / "m.png").stat().st_size > 1_000
     (figure,) = drawn
     axes = figure.axes
+    # pixels of 40 rows and 48 columns are square where 130 of 560 px are the bar and 60 px title and labels
+    assert figure.get_size_inches() * 72 == pytest.approx([560 * (1 + has_events), 430 * 40 // 48 + 60])
     grid = axes[0].get_subplotspec().get_gridspec()
     assert (grid.nrows, grid.ncols) == (1, 1 + has_events) and len(
         [a for a in axes if a.get_subplotspec()]

@@ -109,6 +109,19 @@ def test_bad_pixels_and_their_clusters_are_filled():
         fill.fill_pixels(truth, QUAD, bad[1:])
 
 
+@pytest.mark.parametrize("place", [(0, 4), (8, 4), (4, 0), (4, 10), (0, 0), (8, 10)])
+def test_bad_pixels_at_a_border_have_no_neighbours_at_the_other_one(place):
+    """Mono pixels, 10 per row and 4 per column, with other values at the far border: the fill lies among its own."""
+    rows, cols = np.ogrid[:9, :11]
+    plane = (100 + 10 * rows + 4 * cols).astype(np.float32)
+    far = np.ones(plane.shape, np.bool_)
+    far[max(place[0] - 2, 0) : place[0] + 3, max(place[1] - 2, 0) : place[1] + 3] = False
+    bad = np.zeros(plane.shape, np.bool_)
+    bad[place] = True
+    filled = [fill.fill_pixels(np.where(far, other, plane).astype(np.float32), [[0]], bad)[place] for other in (0, 9e3)]
+    assert filled[0] == filled[1] and abs(filled[0] - plane[place]) <= 14
+
+
 # -- white balance -----------------------------------------------------------------------------------------------
 
 

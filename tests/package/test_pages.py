@@ -207,11 +207,11 @@ def test_the_tests_of_a_claim_are_run_with_the_slow_ones(monkeypatch, capsys):
     monkeypatch.setattr(
         claim.subprocess, "run", lambda command, cwd: asked.append(command) or SimpleNamespace(returncode=5)
     )
-    assert claim.main(["crop", "grey-card"]) == 5
+    assert claim.main(["flow", "grey-card"]) == 5
     (command,) = asked
     assert command[1:3] == ["-m", "pytest"] and "slow or not slow" in command
     assert [part.rpartition("::")[2] for part in command[-2:]] == [
-        "test_a_crop_is_the_full_sensor",
+        "test_flow_equals_differences_of_projected_points",
         "test_grey_card_electrons_by_hand",
     ]
     assert claim.main([]) == 0 and claim.main(["crop", "wolf"]) == 2 and len(asked) == 1

@@ -314,11 +314,18 @@ def test_a_session_goes_from_coarse_to_fine_steps_to_other_lights(tick_us, monke
     np.testing.assert_allclose(fine - fine[:, 3:4], -(fine - fine[:, 3:4])[:, ::-1], atol=1e-12)
     assert pairs == pytest.approx([0.52, 0.68]) and told[-2] == pytest.approx(theta)
     assert told[0] < told[-3] < told[-1] < 1 and len(made._content["busy"]) == 2
+    # without a curve, two thresholds of the sensor file; curves that are hardly apart have their mean
+    for found, expected in (([np.nan, np.nan], [0.54]), ([0.3, 0.303], [0.603]), ([np.nan, 0.31], [0.62])):
+        thetas = iter(found)
+        pairs.clear()
+        made.record()
+        assert pairs == pytest.approx(expected)
 
 
 def test_an_instrument_knows_the_flux_of_each_pixel_and_writes_its_files(tmp_path):
-    sensor = hr.load_sensor("gen2").crop(8, 8)
+    sensor = hr.load_sensor("gen2").crop(16, 8)
     made = Instrument(sensor, tmp_path, 5, lambda what, part: None)
+    assert made._shape == (made._content["rows"], made._content["cols"]) == sensor.layout.evs_shape == (2, 4)
     names = {sensor.spec.pixels[sensor.spec.tile_rows[row][col]].filter for row, col in sensor.spec.positions("evs")}
     flux = {name: electrons_per_s_lux(sensor.spec, name, illuminant("D65")) for name in names}
     window_s = sensor.spec.evs.window_us * 1e-6

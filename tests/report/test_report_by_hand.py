@@ -232,6 +232,20 @@ def test_the_widths_of_an_s_curve_and_their_errors_are_those_of_the_logarithms(m
         assert entries["threshold"]["standard_error"] == pytest.approx(np.sqrt(covariance[0, 0]))
 
 
+@pytest.mark.parametrize(("sign", "part"), [(1, 1), (-1, 2)])
+def test_a_width_that_does_not_show_is_at_most_what_is_a_quarter_as_likely(sign, part):
+    """ln σ/τ goes in steps of 0.1 until the likelihood is below 0.26 of its maximum; its law is normal, or even."""
+    values = np.array([0.21, np.log(0.05), np.log(0.7), special.logit(0.03)])
+    slope, unsure = np.array([0.0, 1.0, 0.4 * sign, 0.0]), np.diag([0.0, 4.0, 1.0, 0.0])
+    own = s_curves._natural(values)[part]
+    for deviation, farthest in ((0.8, 1.4), (np.inf, 8 - sign * np.log(0.7))):
+        fit = SimpleNamespace(total=lambda v, deviation=deviation: -0.5 * ((v[2] - values[2]) / deviation) ** 2)
+        found = s_curves._part(fit, values, unsure, slope, own, "1")
+        there = 0.7 * np.exp(sign * farthest)
+        expected = 0.05 * (there if sign > 0 else 1) / np.hypot(1, there)
+        assert found["value"] == 0 and found["upper_limit"] == pytest.approx(expected, rel=1e-3)
+
+
 def test_ends_of_the_range_are_as_sure_as_the_fewest_answers(monkeypatch):
     """Steps times pixels of the light that has the fewest of them decides how near to 1 a share can be known."""
     counts = []
@@ -241,6 +255,17 @@ def test_ends_of_the_range_are_as_sure_as_the_fewest_answers(monkeypatch):
     limits.dynamic_range(answers, [0.0] * 4)
     each = {one.count * one.pixels for one in answers}
     assert counts == [min(each)] * 2 and len(each) == 4
+
+
+def test_frames_name_the_lights_of_their_figures():
+    """Signals of 4 to 99 % of 3000 DN: linearity takes 5 to 95 %, the gain up to 70 %, without unclear levels."""
+    signal = np.array([120.0, 160.0, 900.0, 2090.0, 2120.0, 2840.0, 2870.0])
+    clear = np.array([True, True, True, True, False, True, True])
+    pairs = SimpleNamespace(has_photons=True, spatial_lit=SimpleNamespace(photons=47.0))
+    result = SimpleNamespace(pairs=pairs, top_dn=3000.0, light=signal * 1.5, clear=clear, signal=signal)
+    lights = emva.FrameFigures(result, {}, []).lights
+    assert lights["K"] == "180 to 3140 photons" and lights["linearity_error_percent"] == "240 to 4260 photons"
+    assert lights["full_well_e"] == "up to 4300 photons" and lights["prnu_percent"] == "47 photons, and dark"
 
 
 def test_a_steady_recording_belongs_to_the_nearest_light_within_a_third():

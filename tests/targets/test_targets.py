@@ -194,6 +194,20 @@ def test_a_zone_plate_has_the_stated_frequency():
     assert np.count_nonzero(np.diff(np.sign(middle - 0.425))) == 20
 
 
+@pytest.mark.parametrize(("width", "height"), [(0.2, 0.13), (0.12, 0.31)])
+def test_the_rings_of_a_zone_plate_are_circles_on_the_target(width, height):
+    """At x and y from the middle, in widths of the target: cos 2π · 7 (x² + y²), whatever its shape."""
+    plate = {"type": "zone-plate", "cycles": 7, "width_m": width, "height_m": height}
+    values = build_target(target_of(plate))[0].reflectance.values[..., 0].astype(float)
+    rows, cols = values.shape
+    x = (np.arange(cols) + 0.5) / cols - 0.5
+    y = ((np.arange(rows) + 0.5) / rows - 0.5) * height / width
+    np.testing.assert_allclose(values, 0.425 + 0.375 * np.cos(14 * np.pi * (x**2 + y[:, None] ** 2)), atol=1e-5)
+    # texels are square within one of them, and the finest rings, of the corners, have 24 texels a cycle
+    assert abs(rows / cols - height / width) * cols <= 1
+    assert 0 <= cols - 24 * 7 * np.hypot(1, height / width) < 1
+
+
 def test_reflectance_outside_0_to_1_is_refused():
     for value in (1.01, -0.1):
         with pytest.raises(ValidationError, match=r"\[0, 1\]"):

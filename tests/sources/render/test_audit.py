@@ -461,6 +461,17 @@ def test_crossings_start_anew_at_each_event_of_the_reference():
     assert crossings([0, 0.3, 0, 0, 0, 0, 0], [0] * 7)["extra"] == 1
 
 
+def test_the_last_step_counts_where_it_belongs_to_the_unit():
+    """Of four steps all are judged, or none before the last: a step at the end is an event there, missed or extra."""
+    step, flat = np.array([0, 0, 0, 0.35])[:, None], np.zeros((4, 1))
+    error, theta = np.full((4, 1), 0.001), (np.array([0.2]), np.array([0.31]))
+    for core in (np.ones(4, np.bool_), np.arange(4) == 3):
+        told = compare_crossings(flat, step, error, theta, core, 8)
+        assert (told.true[0], told.in_run[0], told.missed[0]) == (1, 0, 1)
+        told = compare_crossings(step, flat, error, theta, core, 8)
+        assert (told.true[0], told.in_run[0], told.extra[0]) == (0, 1, 1)
+
+
 class Noisy(Given):
     """A run and a reference that differ from the truth by normal errors, both with two halves."""
 

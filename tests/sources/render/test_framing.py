@@ -12,8 +12,10 @@ import hesim_render as hr
 from hesim_render import cli
 from hesim_render.core.errors import HesimWarning
 from hesim_render.sources.render.camera import place_camera
-from hesim_render.sources.render.framing import framing, outline, warn_if_unseen
-from hesim_render.sources.render.look import look
+from hesim_render.sources.render.framing import framing, outline, posed_view, warn_if_unseen
+from hesim_render.sources.render.look import _colours, look
+from hesim_render.sources.render.scene.builder import build
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 
 LIGHT = {"type": "uniform", "illuminance_lux": 100}
 CARD = {"type": "flat", "width_m": 0.3, "height_m": 0.2}
@@ -55,6 +57,25 @@ def test_tilt_place_and_motion_of_target_and_camera_count():
     bent = framed(scene_of({**small, "width_m": 1.0, "bend_radius_m": 0.5}, camera), mono(40, 40))
     # the ends of an arc of 1 rad at a radius of 0.5 m: x = 0.5 sin 1, z = 0.5 (1 - cos 1)
     np.testing.assert_allclose(bent.fills[0], 0.5 * np.sin(1) / (1 - 0.5 * (1 - np.cos(1))), rtol=1e-9)
+
+
+def test_edges_lie_where_they_are_in_the_picture():
+    """40 by 30 px see 2 m by 1.5 m; a card from −0.35 to 0.2 m and −0.25 to 0.4 m: columns 13 to 24, rows 7 to 20."""
+    card = {"name": "card", "shape": "rectangle", "size_m": [0.55, 0.65, 0], "position_m": [-0.075, 0.075, 0]}
+    scene = make_scene(
+        objects=[{**card, "reflectance": 0.5}], light=[{"type": "uniform", "illuminant": "D65", "illuminance_lux": 9}],
+        camera={"origin_m": [0, 0, 1], "target_m": [0, 0, 0], "horizontal_fov_deg": 90},
+    )  # fmt: skip
+    mi = mitsuba()
+    built = build(mi, scene.spec)
+    view = posed_view(scene.spec, place_camera(scene.spec, mono(40, 30)), 0.0)
+    edges = {(13, 10.3): (1, 0), (24, 10.3): (-1, 0), (18.2, 7): (0, 1), (18.2, 20): (0, -1)}
+    sides = [np.array(place) + 0.02 * sign * np.array(inwards) for place, inwards in edges.items() for sign in (1, -1)]
+    seen = _colours(mi, built.scene, view, *np.array(sides).T).reshape(4, 2, 3)
+    card_seen, beyond = _colours(mi, built.scene, view, np.array([18.2, 1.0]), np.array([11.0, 1.0]))
+    np.testing.assert_allclose(seen[:, 0], np.tile(card_seen, (4, 1)), rtol=0.15)
+    np.testing.assert_allclose(seen[:, 1], np.tile(beyond, (4, 1)), rtol=1e-6)
+    assert np.abs(card_seen - beyond).min() > 0.05
 
 
 @pytest.mark.parametrize(

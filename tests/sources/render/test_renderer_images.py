@@ -151,6 +151,9 @@ def test_directions_are_drawn_with_their_density():
         assert below.min() > -1e-6
         assert below.max() < width + 1e-6
         assert abs(below.mean() - width / 2) < 5 * width / (12 * own.sum()) ** 0.5
+        # all around the axis: sin² is 2 · below, half of it in each direction across
+        across = direction[own] - (direction[own] @ axis)[:, None] * axis
+        assert np.abs(across.mean(axis=0)).max() < 5 * (width / 2 / own.sum()) ** 0.5
     # over the whole sphere the density makes up the chance of being drawn
     z, turn = rng.uniform(-1, 1, count), rng.uniform(0, 2 * np.pi, count)
     around = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
@@ -183,3 +186,16 @@ def test_what_counts_as_a_mirror(walls, images):
         shapes[f"wall{number}"] = wall
     scene = mi.load_dict({"type": "scene", "lamp": lamp, **shapes}, optimize=False)
     assert len(LampImages.of(mi, scene)) == images
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_mirror_of_two_sides_reflects_on_that_of_the_lamp(side):
+    """However it is turned: points on the lamp's side see the image, points behind the mirror do not."""
+    mi = mitsuba()
+    wall = mirror({"type": "twosided", "nested": MIRROR}, side=side)
+    wall["to_world"] = mi.ScalarTransform4f(wall["to_world"])
+    lamp = {"type": "rectangle", "to_world": mi.ScalarTransform4f(placed(LAMP)), "emitter": {"type": "area"}}
+    images = LampImages.of(mi, mi.load_dict({"type": "scene", "lamp": lamp, "wall": wall}, optimize=False))
+    points = mi.Point3f(np.array([[WALL_X - 0.3, 0.1, 0.0], [WALL_X + 0.3, 0.1, 0.0]]).T.astype(np.float32))
+    cones = images.seen_from(points, mi.Vector3f(0, 0, 1), mi.Mask(True))
+    assert np.array(cones.chance)[0] > 0 == np.array(cones.chance)[1]

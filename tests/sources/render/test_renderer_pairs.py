@@ -146,6 +146,30 @@ def test_diffuse_surfaces_have_the_flux_of_the_exact_mode(name):
             assert np.abs(found - wanted).max() < 12 * spread  # groups at edges have more noise than others
 
 
+def test_a_surface_that_turns_its_back_to_the_camera_is_lit_from_the_side_that_is_seen():
+    """A lamp before a sheet and a brighter one behind it: the sheet is seen in the light of the first."""
+    camera = {"origin_m": [0, 0, 2], "target_m": [0, 0, 0], "horizontal_fov_deg": 22}
+    lights = [
+        {
+            "type": "point",
+            "illuminant": "D65",
+            "illuminance_lux": lux,
+            "position_m": [0.3, -0.2, z],
+            "plane_normal": [0, 0, z],
+        }
+        for lux, z in ((200, 1.5), (900, -1.5))
+    ]
+    sheet = {"name": "sheet", "shape": "rectangle", "size_m": [2, 3, 0], "reflectance": 0.4, "rotation_axis": [0, 1, 0]}
+    seen = [
+        traced(pair_tracer(rendering.make_scene(objects=[{**sheet, "rotation_deg": turn}], light=on, camera=camera),
+                           mono(8, 6)), 64).half_a
+        for turn, on in ((0, lights[:1]), (0, lights), (180, lights))
+    ]  # fmt: skip
+    assert seen[0].min() > 0
+    np.testing.assert_allclose(seen[1], seen[0], rtol=1e-4)
+    np.testing.assert_allclose(seen[2], seen[0], rtol=2e-3)  # its rays have other places on the sheet
+
+
 @pytest.mark.parametrize("power", [-70, 60])
 def test_the_scatter_of_a_pilot_has_no_range(power):
     """The mean fourth power over the mean square, by NumPy, of fluxes whose own fourth powers leave float32.
