@@ -176,9 +176,9 @@ class Tuning:
     unseen_change: float = 0.5
     audit_pilot_rays: int = 64
     least_audit_rays: int = 64
-    audit_ray_weight: float = 0.8
+    audit_ray_weight: float = 2.0
     edge_least_audit_rays: int = 1024
-    most_audit_times: int = 8
+    most_audit_times: int = 4
 
     def at(self, quality: float) -> Tuning:
         """The constants for a quality: a better one than 0.5 moves the largest number of rays of a pair."""
