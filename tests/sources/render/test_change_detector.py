@@ -182,6 +182,9 @@ def test_what_a_site_misses_its_neighbours_see():
     for site, is_near in ((8, True), (2, True), (6, True), (12, True), (5, False), (9, False)):
         _, found = found_by(light_of(15, **{f"s{site}": (2, 90.0)}), sites)
         assert (2 in windows_of(found, 7)) == is_near, site
+    # in a window in which it is looked at, what it shows itself counts
+    _, found = found_by(light_of(15, s13=(3, 90.0)), sites)
+    assert 3 in windows_of(found, 13) and 3 not in windows_of(found, 7)
 
 
 def pilot_by(tracer, rays, anchored=None, known=None, span_us=None, stride=1):
