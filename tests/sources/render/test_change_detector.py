@@ -179,12 +179,16 @@ def test_what_a_site_misses_its_neighbours_see():
         _, found = found_by(light_of(15, s7=(come, COUNT, 90.0)), sites)
         assert windows_of(found, 7) == windows
     # in a window in which it is not looked at, a change beside it or diagonally is enough, two columns away is not
-    for site, is_near in ((8, True), (2, True), (6, True), (12, True), (5, False), (9, False)):
+    for site, is_near in ((8, True), (2, True), (6, True), (12, True), (5, False), (0, False), (14, False)):
         _, found = found_by(light_of(15, **{f"s{site}": (2, 90.0)}), sites)
         assert (2 in windows_of(found, 7)) == is_near, site
     # in a window in which it is looked at, what it shows itself counts
     _, found = found_by(light_of(15, s13=(3, 90.0)), sites)
     assert 3 in windows_of(found, 13) and 3 not in windows_of(found, 7)
+    # windows that a site only suspects say nothing of those beside it, nor does it look where nothing may change
+    _, found = found_by(light_of(15, s8=(4, COUNT, 90.0)), sites, near=np.arange(15) != 3)
+    assert windows_of(found, 8) == [2, 3, 4, 5] and 3 not in windows_of(found, 12) and not windows_of(found, 3)
+    assert 4 in windows_of(found, 7)
 
 
 def pilot_by(tracer, rays, anchored=None, known=None, span_us=None, stride=1):
