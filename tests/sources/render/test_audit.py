@@ -16,7 +16,7 @@ from hesim_render.sources.render.audit import audit as audit_module
 from hesim_render.sources.render.audit.audit import STRETCHES, Audit
 from hesim_render.sources.render.audit.compare import Tally, compare_crossings, compare_ticks
 from hesim_render.sources.render.audit.confidence import lower_bound, ratio_upper_bound, upper_bound
-from hesim_render.sources.render.audit.units import NotedFlux
+from hesim_render.sources.render.audit.units import NotedFlux, Units
 
 ROWS, COLS, TICKS, TICK_US = 24, 32, 120, 1000
 QUALITY, UNIT = 0.5, 0.03
@@ -158,6 +158,43 @@ def test_events_of_a_run_that_has_none_in_truth_are_too_many():
     assert audited(truth, truth, 1)["verdict"] == "met"  # nothing moves, and nothing is found
 
 
+def test_neighbours_of_a_tick_are_rendered_again_where_its_events_differ():
+    """A pixel stays brighter from a tick on that in truth changes nothing: that the run's own next value is as bright
+    does not make it true. Ticks with the same event in both take two windows each, others four.
+    """
+    truth = np.full((TICKS, ROWS * COLS), 1e5)
+    run = truth.copy()
+    run[TICKS // 2 :, :3] *= 1.5
+    found = audited(run, truth, 1)["events"]
+    assert found["true_events"] == 0 < found["found_events"] and found["extra"] == found["extra_at_most"] == 1
+    looked = []
+
+    class Counting(Given):
+        def reference_flux(self, pixel, begin_us, end_us, quality, events):
+            looked.extend(np.rint(end_us / TICK_US).astype(int).tolist())
+            return super().reference_flux(pixel, begin_us, end_us, quality, events)
+
+    sensor, core = sensor_of(), np.array([False, False, True, False])
+    step = np.repeat([1e5, 1e5, 1.5e5, 1.5e5], 2).reshape(4, 2)
+    end = np.repeat(np.arange(4, 8) * TICK_US, 2).reshape(4, 2)
+    units = Units(np.array([7, 40], np.uint32), end - 900.0, end.astype(float), core, step, 0 * step, 0.001 * step)
+    lights = np.full((TICKS, ROWS * COLS), 1e5)
+    lights[5:, 7] = 1.5e5
+    source = Counting(lights, lights)
+    pixels = sensor.layout.evs_pixel.ravel()
+    audit = Audit(NotedFlux(source, pixels, TICKS, 1, 2, 1, 1, 1), source, QUALITY, sensor.evs, pixels, 1)
+    reference, _ = audit._reference(units, np.zeros(2, bool), "eventful")
+    assert sorted(looked) == [4, 5, 5, 6, 6, 7] and np.all(reference[:, 1] == 1e5)
+    np.testing.assert_array_equal(reference[:, 0], step[:, 0])
+    # of units without events the window before is needed, of those that stand still the judged one alone
+    looked.clear()
+    audit._reference(units, np.array([True, False]), "calm")
+    assert sorted(looked) == [5, 6, 6]
+    looked.clear()
+    audit._reference(units, np.array([True, False]), "frames")
+    assert sorted(looked) == [6, 6]
+
+
 @pytest.mark.slow  # a run of the command line tells it, too
 def test_verdict_and_the_quality_that_would_do():
     truth = np.full((TICKS, ROWS * COLS), 1e5)
@@ -171,6 +208,42 @@ def test_verdict_and_the_quality_that_would_do():
     assert bad["quality_needed"] == pytest.approx(0.5 * 1.5 / 3.1, rel=0.15)
     short = audited(truth, truth, 1, rays_each=50_000)
     assert short["verdict"] == "not shown" and short["quality_needed"] is None
+
+
+@pytest.mark.parametrize(
+    ("shares", "times", "expected"),
+    [
+        ([(0.0, 0.06, 0.02)], 8.9, True),
+        ([(0.0, 0.06, 0.02)], 9.1, False),
+        ([(0.01, 0.03, 0.02)], 3.9, True),
+        ([(0.01, 0.03, 0.02)], 4.1, False),
+        # far above the limit, and not quite so far
+        ([(0.03, 0.039, 0.02)], 50.0, True),
+        ([(0.03, 0.041, 0.02)], 1.1, False),
+        # one share is enough
+        ([(0.001, 0.004, 0.02), (0.0, 0.06, 0.02)], 2.0, True),
+        ([], 2.0, False),
+    ],
+)
+def test_what_more_units_would_not_show(shares, times, expected):
+    assert audit_module._is_hopeless(shares, times) is expected
+
+
+def test_an_audit_gives_up_where_its_rays_would_not_do(monkeypatch):
+    """Few events, all of them right: that none is missed takes more units than it may look at. It looks at calm units
+    for an eighth of its rays, and leaves most of the others.
+    """
+    monkeypatch.setattr(audit_module, "_PART", 0.0)
+    monkeypatch.setattr(audit_module, "_RAYS", 300_000)
+    monkeypatch.setattr(audit_module, "_LEAST_BATCH", 64)
+    truth = np.full((TICKS, ROWS * COLS), 1e5)
+    truth[::2, :3] *= 1.5
+    given_up = audited(truth, truth, 1, rays_each=40)
+    assert given_up["verdict"] == "not shown" and 0.125 * 300_000 < given_up["rays"] < 0.5 * 300_000
+    monkeypatch.setattr(audit_module, "_is_hopeless", lambda shares, times: False)
+    whole = audited(truth, truth, 1, rays_each=40)
+    assert whole["verdict"] == "not shown" and whole["rays"] > 300_000
+    assert whole["events"]["missed_at_most"] > whole["events"]["missed_wanted_at_most"]
 
 
 class HalfStill(Given):

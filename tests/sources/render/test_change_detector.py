@@ -12,9 +12,10 @@ from hesim_render.core.backend import jit
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven import pilot as pilots
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
-from hesim_render.sources.render.change_driven.change_detector import FirstLook, windows_with_changes
+from hesim_render.sources.render.change_driven.change_detector import windows_with_changes
+from hesim_render.sources.render.change_driven.error_target import Noise
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.change_driven.neighbours import Sites
+from hesim_render.sources.render.change_driven.neighbours import Lattice, Sites
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux, PilotRays
 from hesim_render.sources.render.change_driven.pilot import Anchored, take_pilot
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -26,13 +27,13 @@ COUNT, SITES = 10, 7
 
 class Detected:
     """A tracer of pixels with the flux `light` [window, site]: the plain estimator is brighter by 5, and the set of
-    rays with number 1 does not see what changes in site 4.
+    rays with number 1 does not see what changes in site 4. `spread` replaces the scatter of the controlled estimator.
     """
 
     camera = None
 
-    def __init__(self, light, scatter=(40.0, 70.0), near=True):
-        self.light, self.scatter, self.near, self.traced = light, scatter, near, []
+    def __init__(self, light, scatter=(40.0, 70.0), near=True, spread=None):
+        self.light, self.scatter, self.near, self.traced, self.spread = light, scatter, near, [], spread
         self.rays, self.parts = SimpleNamespace(spreads=False), SimpleNamespace(groups=[])
 
     def pilot(self, index, window, windows, rays, width_px, stream=Stream.RENDER_PILOT, span_us=None, before=None,
@@ -45,6 +46,8 @@ class Detected:
             light = np.where(index == 4, self.light[0, index], light)
         found.controlled[:], found.plain[:] = light, light + 5
         found.controlled_scatter[:], found.plain_scatter[:] = self.scatter
+        if self.spread is not None:
+            found.controlled_scatter[:] = self.spread[window, index]
         found.met[:] = self.near
         return found
 
@@ -52,27 +55,54 @@ class Detected:
         return sorted((window, index) for *_, count, _, _, window, index in self.traced if count == rays)
 
 
-def light_of(**changes):
-    """Flux of all sites in all windows; `s3=(5, 12.0)` changes site 3 in window 5 by 12."""
-    light = np.full((COUNT, SITES), 800.0, np.float32)
-    for name, (window, by) in changes.items():
-        light[window, int(name[1:])] += by
+def light_of(sites=SITES, **changes):
+    """Flux of all sites in all windows; `s3=(5, 12.0)` changes site 3 in window 5 by 12, `s3=(5, 8, 12.0)` in windows 5
+    to 7.
+    """
+    light = np.full((COUNT, sites), 800.0, np.float32)
+    for name, (window, *end, by) in changes.items():
+        light[window : end[0] if end else window + 1, int(name[1:])] += by
     return light
 
 
-def found_by(light, even=True, controlled=True):
-    tracer, every = Detected(light), np.ones(SITES, bool)
-    first = FirstLook(every & controlled, every & even, np.full(SITES, 6.0, np.float32))
-    numbers = np.repeat(np.arange(COUNT)[:, None], SITES, axis=1)
+def wanted_error(flux):
+    """A twentieth of the light beyond 600."""
+    return np.where(flux > 600, WANTED * flux / 800, 15).astype(np.float32)
+
+
+def found_by(light, sites=None, first=(59.0, 70.0), near=True, spread=None):
+    sites = Sites.alone(np.arange(light.shape[1], dtype=np.uint32)) if sites is None else sites
+    tracer, seen = Detected(light, spread=spread), PilotFlux.empty(sites.size)
+    seen.controlled[:], seen.plain[:] = 800, 805
+    seen.controlled_scatter[:], seen.plain_scatter[:] = first
+    numbers = np.repeat(np.arange(COUNT)[:, None], sites.size, axis=1)
     windows = Windows(np.arange(COUNT) * 4.0, np.arange(COUNT) * 4.0 + 3)
-    window, place = windows_with_changes(tracer, np.arange(SITES, dtype=np.uint32), numbers, windows, first, 1.6)
-    return tracer, sorted(zip(window.tolist(), place.tolist(), strict=True))
+    near = np.ones(sites.size, bool) & near
+    marked = windows_with_changes(tracer, sites, numbers, windows, seen, near, wanted_error, 1.6)
+    return tracer, sorted(zip(*(each.tolist() for each in np.nonzero(marked)), strict=True))
+
+
+def windows_of(found, site):
+    return [window for window, each in found if each == site]
 
 
 def test_windows_beside_a_change_are_looked_at():
-    """A change of 7 counts and one of 5 does not; the first and the last window are no part of this."""
-    _, found = found_by(light_of(s3=(5, -7.0), s1=(4, 5.0), s2=(1, 90.0), s6=(9, 90.0)))
-    assert found == [(1, 2), (2, 2), (4, 3), (5, 3), (6, 3)]
+    """A fifth of the wanted error of 30 counts. A set of rays that saw a brief change sees its end two windows later;
+    the first and the last window are no part of this.
+    """
+    _, found = found_by(light_of(s3=(5, -7.0), s1=(4, 5.5), s2=(1, 90.0), s6=(9, 90.0)))
+    assert windows_of(found, 2) == [1, 2, 3, 4] and windows_of(found, 3) == [4, 5, 6, 7, 8] and len(found) == 9
+
+
+def test_what_stays_after_a_change_is_not_looked_at_again():
+    _, found = found_by(light_of(s3=(4, COUNT, 300.0), s5=(4, COUNT, -100.0)))
+    # window 4 by one set, 5 by the other, and those beside
+    assert windows_of(found, 3) == windows_of(found, 5) == [3, 4, 5, 6]
+    # beyond the change a fifth of the error wanted there counts: 8.25 of 41.25
+    for by, windows in ((8.0, [3, 4, 5, 6]), (8.5, [3, 4, 5, 6, 7, 8])):
+        light = light_of(s3=(4, COUNT, 300.0))
+        light[7:, 3] += by
+        assert windows_of(found_by(light)[1], 3) == windows
 
 
 def test_windows_take_turns_between_two_sets_of_rays():
@@ -80,9 +110,9 @@ def test_windows_take_turns_between_two_sets_of_rays():
     first window.
     """
     tracer, found = found_by(light_of(s4=(6, 90.0), s5=(6, 90.0)))
-    assert found == [(5, 5), (6, 5), (7, 5)]
+    assert found == [(window, 5) for window in (5, 6, 7, 8)]
     _, found = found_by(light_of(s4=(5, 90.0)))
-    assert found == [(4, 4), (5, 4), (6, 4)]
+    assert found == [(window, 4) for window in (4, 5, 6, 7, 8)]
     sets = {(repeat, window) for _, _, _, repeat, window, _ in tracer.traced}
     assert sets == {(0, w) for w in (0, 1, 3, 5, 7)} | {(1, w) for w in (0, 2, 4, 6, 8)}
     assert len(tracer.traced) == len(sets) * SITES
@@ -90,22 +120,75 @@ def test_windows_take_turns_between_two_sets_of_rays():
 
 
 def test_pixels_whose_rays_differ_are_looked_at_in_all_windows():
-    even = np.arange(SITES) != 3
-    tracer, found = found_by(light_of(s1=(2, 50.0)), even=even)
-    assert found == sorted([(1, 1), (2, 1), (3, 1), *((window, 3) for window in range(1, COUNT - 1))])
-    assert 3 not in {index for *_, index in tracer.traced}
+    """Twice the wanted error of 30 is even; nothing is looked at where nothing may change."""
+    scatter = np.full(SITES, 59.0), np.full(SITES, 70.0)
+    scatter[0][3] = 61
+    scatter[0][[2, 5]], scatter[1][[2, 5]] = 90, (59, 63)
+    near = np.arange(SITES) != 6
+    tracer, found = found_by(light_of(s1=(2, 3, 50.0), s6=(2, 50.0)), first=scatter, near=near)
+    inner = range(1, COUNT - 1)
+    assert windows_of(found, 3) == windows_of(found, 5) == list(inner)
+    assert windows_of(found, 1) == [1, 2, 3, 4, 5] and not windows_of(found, 6) and not windows_of(found, 2)
+    assert not {3, 5, 6} & {index for *_, index in tracer.traced}
 
 
-def test_a_first_look_takes_the_estimator_of_less_scatter():
-    """Even up to a scatter of 60; a fifth of the wanted error counts as a change, or what rounding explains if more."""
-    first = PilotFlux.empty(4)
-    first.controlled_scatter[:], first.plain_scatter[:] = (59, 61, 90, 90), (70, 70, 61, 59)
-    flux = np.array([800, 800, 800, 4e6], np.float32)
-    seen = FirstLook.of(flux, first, lambda value: np.full(value.shape, WANTED, np.float32))
-    assert seen.controlled.tolist() == [True, True, False, False] and seen.even.tolist() == [True, False, False, True]
-    np.testing.assert_allclose(seen.least, [6, 6, 6, 40], rtol=1e-6)
-    some = seen.at(np.array([3, 1]))
-    assert some.even.tolist() == [True, False] and some.least[0] == pytest.approx(40)
+def test_windows_in_which_few_rays_differ_are_looked_at():
+    """A window whose light is the same on the mean, at an edge that goes through the pixel."""
+    spread = np.full((COUNT, SITES), 40.0, np.float32)
+    spread[3, 2], spread[6, 5] = 59.0, 69.0
+    # of the second set, plain rays scatter less there, and are brighter by 5: that is no change
+    _, found = found_by(light_of(), spread=spread)
+    assert found == [(5, 5), (6, 5), (7, 5)]
+
+
+def board(rows=3, cols=5, step=(1, 1)):
+    """Sites of all pixels of a small sensor, or of all that lie on a lattice."""
+    first = (0, 0) if step == (1, 1) else (1, 2)
+    lattice = Lattice(rows, cols, first, step, cols * step[1] + first[0])
+    row, col = np.divmod(np.arange(rows * cols), cols)
+    return Sites.around(lattice.index(row, col), lattice)
+
+
+@pytest.mark.parametrize("step", [(1, 1), (2, 3)])
+def test_neighbours_take_turns_like_the_fields_of_a_chequered_board(step):
+    """Each site in about half of the windows, never in the same as the four beside it; all in the first and in the
+    last but one; over three windows each site or the four beside it is always looked at.
+    """
+    sites = board(step=step)
+    tracer, found = found_by(light_of(int(sites.index[-1]) + 1), sites)
+    assert not found
+    looked = np.zeros((COUNT, sites.size), bool)
+    for *_, repeat, window, index in tracer.traced:
+        assert repeat == 0
+        looked[window, np.searchsorted(sites.index, index)] = True
+    looked = looked.reshape(COUNT, 3, 5)
+    assert looked[0].all() and looked[COUNT - 2].all() and not looked[-1].any()
+    inner = looked[1 : COUNT - 2]
+    # at most two windows in a row, and no turn that a motion of a pixel a window keeps pace with
+    assert inner[:, 0, 0].tolist() == [True, True, False, True, False, False, True]
+    assert np.all(inner[:, 1:] ^ inner[:, :-1]) and np.all(inner[:, :, 1:] ^ inner[:, :, :-1])
+
+
+def test_what_a_site_misses_its_neighbours_see():
+    """Site 7, in the middle, is looked at in windows 3, 5, 6 and 8."""
+    sites = board()
+    tracer, _ = found_by(light_of(15), sites)
+    assert sorted(window for *_, window, index in tracer.traced if index == 7) == [0, 3, 5, 6, 8]
+    # what comes and stays is seen the next time, and all windows since the last look are suspects
+    for come, windows in ((2, [1, 2, 3, 4]), (4, [3, 4, 5, 6]), (7, [6, 7, 8])):
+        _, found = found_by(light_of(15, s7=(come, COUNT, 90.0)), sites)
+        assert windows_of(found, 7) == windows
+    # in a window in which it is not looked at, a change beside it or diagonally is enough, two columns away is not
+    for site, is_near in ((8, True), (2, True), (6, True), (12, True), (5, False), (0, False), (14, False)):
+        _, found = found_by(light_of(15, **{f"s{site}": (2, 90.0)}), sites)
+        assert (2 in windows_of(found, 7)) == is_near, site
+    # in a window in which it is looked at, what it shows itself counts
+    _, found = found_by(light_of(15, s13=(3, 90.0)), sites)
+    assert 3 in windows_of(found, 13) and 3 not in windows_of(found, 7)
+    # windows that a site only suspects say nothing of those beside it, nor does it look where nothing may change
+    _, found = found_by(light_of(15, s8=(4, COUNT, 90.0)), sites, near=np.arange(15) != 3)
+    assert windows_of(found, 8) == [2, 3, 4, 5] and 3 not in windows_of(found, 12) and not windows_of(found, 3)
+    assert 4 in windows_of(found, 7)
 
 
 def pilot_by(tracer, rays, anchored=None, known=None, span_us=None, stride=1):
@@ -126,12 +209,36 @@ def test_a_pilot_of_many_rays_looks_where_few_see_a_change_and_at_the_end():
     pilot = pilot_by(tracer, 32)
     np.testing.assert_array_equal(pilot.controlled, light)
     ends = [(window, site) for window in (0, 9) for site in range(SITES)]
-    assert tracer.looked(32) == sorted([*ends, (4, 3), (5, 3), (6, 3)]) and tracer.looked(8)
-    # as many rays as the detector has would not be worth its rays; nor does it look at a sensor without a tick
-    for rays, stride in ((16, 1), (32, 3)):
+    assert tracer.looked(32) == sorted([*ends, *((window, 3) for window in range(4, 9))]) and tracer.looked(8)
+    # few rays do not look at a sensor without a tick, nor where the pilot has no more
+    for rays, stride in ((8, 1), (32, 3)):
         tracer = Detected(light)
         pilot_by(tracer, rays, stride=stride)
-        assert not tracer.looked(8)
+        assert Stream.RENDER_DETECTOR not in {each[0] for each in tracer.traced}
+
+
+def test_windows_between_looks_show_what_the_one_before_does():
+    """A step of site 3 is looked at in four windows; later ones keep the light, and how its rays changed since the
+    first window. Those before have that of the first, from which they do not differ.
+    """
+    light = light_of(s3=(4, COUNT, 300.0))
+    tracer, zeros = Detected(light), jit().Float(np.zeros(32 * SITES, np.float32))
+    own = tracer.pilot
+
+    def pilot(index, window, *given, **more):
+        found = own(index, window, *given, **more)
+        found.unshadowed[:], found.controlled_change[:], found.plain_change[:] = 900 + window, 10 + window, 30 + window
+        return found
+
+    tracer.pilot = pilot
+    tracer.pilot_rays = lambda *given, span_us=None, before=None: (pilot(*given), PilotRays(zeros, zeros, 32, (0.0, 3)))
+    known = PilotRays(zeros, zeros, 32, (-4.0, -1.0))
+    anchored = Anchored(pilot(np.arange(SITES), np.zeros(SITES, int), None, 32, 1.6), known, (-4.0, -1.0))
+    taken = pilot_by(tracer, 32, anchored=anchored)
+    np.testing.assert_array_equal(taken.controlled, light)
+    assert taken.unshadowed[:, 3].tolist() == [900, 900, 900, 903, 904, 905, 906, 906, 906, 909]
+    assert taken.change.controlled_scatter[:, 3].tolist() == [10, 0, 0, 13, 14, 15, 16, 16, 16, 19]
+    assert taken.change.plain_scatter[:, 2].tolist() == [30, *[0] * 8, 39]
 
 
 def test_a_block_that_begins_with_its_anchor_takes_its_pilot():
@@ -149,7 +256,7 @@ def test_a_block_that_begins_with_its_anchor_takes_its_pilot():
         anchored = Anchored(first, rays, window_us, near_us)
         pilot = pilot_by(tracer, 16, anchored=anchored, span_us=(0.0, 39.0))
         assert pilot.controlled[0, 2] == (640 if is_known else 800), (window_us, near_us)
-        assert any(window == 0 for *_, window, _ in tracer.traced) != is_known
+        assert any(count == 16 and window == 0 for _, count, _, _, window, _ in tracer.traced) != is_known
         assert np.all(pilot.change.controlled[0] == pilot.controlled[0] - 640)
 
 
@@ -159,12 +266,48 @@ def test_a_known_first_window_is_not_traced():
     assert np.all(pilot_by(tracer, 16, known=known).controlled == 533) and not tracer.traced
 
 
+@pytest.mark.parametrize(
+    ("name", "changes", "expected"),
+    [
+        ("davis346", {}, ((0, 0), (1, 1), 260, 346)),
+        ("gen2", {}, ((1, 2), (4, 4), 612, 816)),
+        ("eiger", {}, ((1, 1), (2, 2), 1224, 1632)),
+        # rows 0 and 3 of four are no lattice, nor are two pixels on a diagonal
+        ("gen2", {"tile": "R R w G\nR R G G\nG G B B\nG G w B\n", "evs_grid.rows_per_tile": 2}, None),
+        ("gen2", {"tile": "w R G G\nR R G G\nG G w B\nG G B B\n", "evs_grid.rows_per_tile": 2}, None),
+    ],
+)
+def test_event_pixels_lie_on_a_lattice_or_on_none(name, changes, expected):
+    lattice = Noise(hr.load_sensor(name, changes)).lattice("events")
+    assert (lattice and (lattice.first, lattice.step, lattice.rows, lattice.cols)) == expected
+
+
+def test_a_lattice_that_the_sensor_cuts_ends_with_its_last_pixel():
+    lattice = Noise(hr.load_sensor("gen2", {"geometry.rows": 52, "geometry.cols": 56})).lattice("events")
+    assert (lattice.rows, lattice.cols) == (13, 14)
+    assert lattice.index(np.array([12]), np.array([13])).tolist() == [49 * 56 + 54]
+    row, col = lattice.place(np.array([49 * 56 + 54], np.uint32))
+    assert (row.tolist(), col.tolist()) == ([12], [13])
+
+
+def test_pixels_that_lie_apart_have_the_same_flux_in_a_crop():
+    """Those around a crop decide with it, and are no part of it."""
+    whole = hr.load_sensor("gen2", {"evs.threshold_mismatch_rel": 0.02}).crop(72, 48)
+    part = whole.crop(28, 20, 16, 12)
+    inner = np.zeros((48 // 4, 72 // 4), bool)
+    inner[3:8, 4:11] = True
+    scene = shadow_scene(focal_length_mm=0.24)
+    every, some = (fluxes(ChangeDrivenFlux(scene, sensor, seed=4), 0, 25_000) for sensor in (whole, part))
+    assert np.ptp(some, axis=0).max() > 0.1 * some.max()
+    np.testing.assert_array_equal(every[..., inner.ravel()], some)
+
+
 def test_ticks_of_lone_pixels_keep_their_flux_with_a_detector(monkeypatch):
     """A shadow moves over pixels that lie apart: the same flux to the bit but in a few pairs, for fewer pilot rays."""
     sensor = hr.load_sensor("gen2", {"evs.threshold_mismatch_rel": 0.02}).crop(72, 48, 16, 8)
     found = []
-    for worth in (4, 1000):
-        monkeypatch.setattr(pilots, "WORTH", worth)
+    for rays in (8, 1000):
+        monkeypatch.setattr(pilots, "DETECTOR_RAYS", rays)
         source = ChangeDrivenFlux(shadow_scene(), sensor, seed=4)
         found.append((fluxes(source, 0, 25_000), source.counts.pilot_rays, source))
     (some, fewer, _), (every, most, source) = found
@@ -212,4 +355,5 @@ def test_a_run_begins_with_the_flux_of_its_anchor():
         setattr(tracer, name, noted)
     for _ in source.flux_of_blocks(pixels, blocks):
         pass
-    assert len(traced) == len(set(traced)) == 2 * pixels.size
+    # the pilot looks at those around them as well: 12 × 18 of 14 × 20
+    assert len(traced) == len(set(traced)) == pixels.size + 14 * 20 and pixels.size == 12 * 18

@@ -14,7 +14,7 @@ from hesim_render.sources.render.change_driven import forecast
 from hesim_render.sources.render.change_driven.allocation import allocate
 from hesim_render.sources.render.change_driven.differences import Differences
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
+from hesim_render.sources.render.change_driven.neighbours import REACH, Lattice, Sites
 from hesim_render.sources.render.change_driven.pilot import Pilot, Refinement
 from hesim_render.sources.render.change_driven.plan import Plan, changes, longer, plan
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain, Tuning
@@ -48,7 +48,7 @@ def test_what_is_rendered_around_a_change(step, reach):
     Of a change in window 4 that stays, the windows 3 and 4 are rendered; beyond a pixel away one more on either side.
     """
     quality, unit, windows = 0.5, 10.0, 9
-    sites = Sites.around(np.arange(9 * 9, dtype=np.uint32), 9, 9)
+    sites = Sites.around(np.arange(9 * 9, dtype=np.uint32), Lattice.whole(9, 9))
     flux = np.full((windows, 81), 1e5, np.float32)
     flux[4:, 4 * 9 + 4] += step * 0.7 * 3 * quality * unit
     nothing = np.zeros_like(flux)
@@ -74,10 +74,10 @@ def test_longer_marks_reach_no_further():
 def test_neighbours_of_a_crop_are_those_of_the_full_sensor():
     rng, rows, cols = np.random.default_rng(1), 40, 50
     image = rng.random(rows * cols).astype(np.float32)
-    every = Sites.around(np.arange(rows * cols, dtype=np.uint32), rows, cols)
+    every = Sites.around(np.arange(rows * cols, dtype=np.uint32), Lattice.whole(rows, cols))
     row, col = np.meshgrid(np.arange(12, 20), np.arange(15, 30), indexing="ij")
     listed = (row * cols + col).ravel().astype(np.uint32)
-    some = Sites.around(rng.permutation(listed), rows, cols)
+    some = Sites.around(rng.permutation(listed), Lattice.whole(rows, cols))
     order = some.index[some.listed]
     np.testing.assert_array_equal(np.sort(order), np.sort(listed))
     np.testing.assert_array_equal(some.mean(image[some.index]), every.mean(image)[order])
@@ -102,7 +102,7 @@ def rays_of(pilot, quality=0.5, unit=0.03):
 
 def allocated(pilot, quality=0.5, unit=0.03):
     count = pilot.controlled.shape[1]
-    sites = Sites.around(np.arange(count, dtype=np.uint32), 1, count)
+    sites = Sites.around(np.arange(count, dtype=np.uint32), Lattice.whole(1, count))
     units = unit * np.ones(pilot.controlled.shape, np.float32)
     return allocate(pilot, 0, sites, units, quality, Gain(*TUNING.diffuse_gain), TUNING, False)
 

@@ -11,10 +11,11 @@ from test_change_driven import fluxes, noisy
 import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.mosaic.schedule import tick_blocks
+from hesim_render.sources.render.change_driven import pilot as pilots
 from hesim_render.sources.render.change_driven.anchor import anchor_us, period_us
 from hesim_render.sources.render.change_driven.differences import difference_of, differences
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.change_driven.neighbours import Sites
+from hesim_render.sources.render.change_driven.neighbours import Lattice, Sites
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, PilotRays, not_negative
 from hesim_render.sources.render.change_driven.pilot import Anchored, Change, Pilot, Refinement, take_pilot
 from hesim_render.sources.render.change_driven.tuning import TUNING
@@ -27,7 +28,7 @@ CENTRE = 5 * 11 + 5
 
 
 def sites_of(size=11):
-    return Sites.around(np.arange(size * size, dtype=np.uint32), size, size)
+    return Sites.around(np.arange(size * size, dtype=np.uint32), Lattice.whole(size, size))
 
 
 def pilot_of(windows, open_flux=0.0, **tables):
@@ -179,8 +180,10 @@ def test_sites_near_a_mark():
     np.testing.assert_array_equal(alone.near(marked, 2), marked)
 
 
-def shadow_scene():
-    """A plate that turns before a wall in even light: its shadow is one wide penumbra."""
+def shadow_scene(**lens):
+    """A plate that turns before a wall in even light: its shadow is one wide penumbra. Without a focal length, the
+    region that is read out sees 24°.
+    """
     wall = {"name": "wall", "shape": "rectangle", "size_m": [3, 3, 0], "position_m": [0, 0, -0.09], "reflectance": 0.37}
     plate = {"name": "plate", "shape": "rectangle", "size_m": [0.14, 0.05, 0], "position_m": [0.01, 0, 0],
              "reflectance": 0.8, "pattern": 0.25, "pattern_count": [3, 2]}  # fmt: skip
@@ -188,7 +191,7 @@ def shadow_scene():
     return make_scene(
         objects=[wall, plate],
         light={"type": "uniform", "illuminant": "D65", "illuminance_lux": 700},
-        camera={"origin_m": [0, 0, 0.6], "target_m": [0, 0, 0], "horizontal_fov_deg": 24},
+        camera={"origin_m": [0, 0, 0.6], "target_m": [0, 0, 0], **(lens or {"horizontal_fov_deg": 24})},
         motion=[{"object": "plate", "keyframes": keys}],
     )
 
@@ -232,9 +235,10 @@ def rays_without(scene, sensor):
     return source.counts.rays
 
 
-def test_looks_that_halve_find_what_all_looks_find():
+def test_looks_that_halve_find_what_all_looks_find(monkeypatch):
     """The same flux to the bit but at a few pairs, which are no farther off than noise, for fewer rays of the pilot."""
     sensor = hr.load_sensor("davis346", {"evs.threshold_mismatch_rel": 0.02}).crop(40, 24)
+    monkeypatch.setattr(pilots, "DETECTOR_RAYS", 1000)
     found = []
     for stride in (1, TUNING.look_stride):
         source = ChangeDrivenFlux(shadow_scene(), sensor, seed=4, tuning=replace(TUNING, look_stride=stride))
@@ -295,9 +299,11 @@ def test_what_a_pilot_compares_and_between_which_looks_it_traces():
     np.testing.assert_array_equal(pilot.controlled, light)
     assert not pilot.all_move
     row, col = np.indices((11, 11))
-    busy = np.flatnonzero(((abs(row - 5) <= 2) & (abs(col - 5) <= 2)).ravel())
+    # within half of the stride, what comes from one pixel away
+    busy, beside = (np.flatnonzero(((abs(row - 5) <= k) & (abs(col - 5) <= k)).ravel()) for k in (2, 1))
     looks = [(window, site) for window in (0, 4, 8) for site in range(121) if window == 0 or site != far]
-    assert sorted(tracer.traced) == sorted([*looks, *((window, site) for window in (5, 6) for site in busy)])
+    halved = [(6, site) for site in busy] + [(5, site) for site in beside]
+    assert sorted(tracer.traced) == sorted([*looks, *halved])
     # the ends are compared with the anchor, those between with the first window
     scatter, site = pilot.change.controlled_scatter, np.arange(121)
     near_by = site != far

@@ -41,6 +41,8 @@ _COMPARES_WITH = "the same renderer with other random numbers; a wrong model of 
 _LEAST_BATCH, _MOST_BATCH = 256, 16384
 #: Upper limit for the rays of an audit: a part of the run's own rays, or a fixed number if that is more.
 _PART, _RAYS = 0.25, 30_000_000
+#: Part of these rays after which an audit may give up, because the others would not show what is left to show either.
+_TRIED = 0.125
 
 
 class Audit:
@@ -100,13 +102,15 @@ class Audit:
                     self._event_bounds(tally)["extra_at_most"] <= MOST_EXTRA / 2 and spent > room / 8
                 ):
                     break
+        start = self._source.rays_traced
         for number, batch in enumerate(batches):
             if events and number >= seen:
                 self._look_at(batch, tally, "eventful")
             self._look_at(batch, tally, "calm" if events else "frames")
             result = self._bounds(tally, events)
-            enough = all(bound <= most for _, bound, most in _shares(result))
-            if enough or self._source.rays_traced - begin > room:
+            shares, own, left = _shares(result), self._source.rays_traced - start, room - (start - begin)
+            enough = all(bound <= most for _, bound, most in shares)
+            if enough or own > left or (own > _TRIED * room and _is_hopeless(shares, left / own)):
                 break
         return result
 
@@ -180,23 +184,39 @@ class Audit:
         """Flux by other random numbers, and half the difference of its halves, [window, unit], e⁻/s. Windows that are
         not needed keep the values of the run.
         """
-        needed = np.zeros(units.flux.shape, np.bool_)
-        core = np.flatnonzero(units.core)
-        needed[core] = True
-        if which == "calm" and core[0] > 0:
-            # a unit without events in the run can only have missed ones: their windows are enough
-            needed[core[0] - 1] |= ~still
-        elif which == "eventful":
-            needed[:] |= ~still
         reference, difference = units.flux.copy(), np.zeros(units.flux.shape)
-        place = np.nonzero(needed)[1]
-        reference[needed], difference[needed] = self._source.reference_flux(
-            units.pixel[place],
-            *(units.begin_us[needed], units.end_us[needed]),
-            _REFERENCE * self._quality,
-            events=which != "frames",
-        )
+
+        def trace(needed: NDArray[np.bool_]) -> None:
+            place = np.nonzero(needed)[1]
+            reference[needed], difference[needed] = self._source.reference_flux(
+                units.pixel[place],
+                *(units.begin_us[needed], units.end_us[needed]),
+                _REFERENCE * self._quality,
+                events=which != "frames",
+            )
+
+        first = int(np.flatnonzero(units.core)[0])
+        needed = np.repeat(units.core[:, None], units.pixel.size, axis=1)
+        if first > 0 and which != "frames":
+            needed[first - 1] |= ~still
+        # a unit without events in the run can only have missed ones: their windows are enough
+        if which != "eventful":
+            trace(needed)
+            return reference, difference
+        if self._noise is not None and self._noise.spec.reference == "previous_sample":
+            trace(needed)
+            # where both have the same event in the tick that is judged, its neighbours have nothing to say
+            unlike = self._tick_event(units, units.flux, first) != self._tick_event(units, reference, first)
+            trace(~needed & ~still & unlike)
+        else:
+            trace(needed | ~still)
         return reference, difference
+
+    def _tick_event(self, units: Units, flux: NDArray[np.float64], window: int) -> NDArray[np.int8]:
+        """Polarity of the event of each unit in a window, 0 without one, as in the first window of all."""
+        signal, (on, off) = self._log(units.pixel, flux), self._thresholds(units.pixel)
+        change = signal[window] - signal[max(0, window - 1)]
+        return (change > on).astype(np.int8) - (change < -off).astype(np.int8)
 
     def _has_event(self, units: Units) -> NDArray[np.bool_]:
         """Units in which the run may have an event, [unit]."""
@@ -309,6 +329,16 @@ def _shares(part: dict[str, Any]) -> list[tuple[float, float, float]]:
     names += ["missed"] if part.get("true_events") else []
     names += ["extra"] if part.get("found_events") else []
     return [(part[name], part[f"{name}_at_most"], part[f"{name}_wanted_at_most"]) for name in names]
+
+
+def _is_hopeless(shares: list[tuple[float, float, float]], times: float) -> bool:
+    """True if so many times the units would hardly change the verdict. The distance of a bound from its estimate falls
+    with the root of their number: it would not be below the limit, or the estimate is as far above it.
+    """
+    return any(
+        share + (bound - share) / np.sqrt(times) > most if share <= most else share - (bound - share) > most
+        for share, bound, most in shares
+    )
 
 
 _PARTS = {"median": 0.5, "p95": 0.95, "p99": 0.99}

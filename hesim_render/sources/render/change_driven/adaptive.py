@@ -78,7 +78,7 @@ class AdaptiveRenderer:
 
     def bands(self, pixel: NDArray[np.uint32], role: Role) -> Iterator[Band]:
         """The listed pixels in bands of successive rows."""
-        index, geometry = self.index[pixel], self._sensor.spec.geometry
+        index, lattice = self.index[pixel], self.noise.lattice(role)
         order, apart, tuning = np.argsort(index, kind="stable"), self.noise.is_apart(role), self.tuning
         rays = tuning.lone_pilot_rays if apart else tuning.pilot_rays
         quality = self.quality
@@ -86,7 +86,11 @@ class AdaptiveRenderer:
             rays, quality = tuning.frame_pilot_rays, quality / tuning.frame_margin
         for first in range(0, order.size, _BAND_PIXELS):
             place = order[first : first + _BAND_PIXELS]
-            sites = Sites.alone(index[place]) if apart else Sites.around(index[place], geometry.rows, geometry.cols)
+            # a single window is not followed through time, and needs no pixels beside those that lie apart
+            if lattice is None or (apart and role == "any"):
+                sites = Sites.alone(index[place])
+            else:
+                sites = Sites.around(index[place], lattice)
             yield Band(place, sites, self.noise.of(role, sites.index), apart, rays, quality)
 
     def pilot(

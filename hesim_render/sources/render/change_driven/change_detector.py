@@ -1,38 +1,36 @@
 """Few rays tell in which windows a pixel shows anything new.
 
-Pixels without neighbours of their own kind take many pilot rays, and a sensor with a tick has to be looked at in each
-window, since things move by pixels from one tick to the next. Most pixels show the same in all windows of a block. A
-quarter of the rays is enough to see that in a pixel whose rays all see the same light in the first window: whatever
-comes is brighter or darker. Where rays differ already, as in a penumbra, a small change turns few of them, and such
-pixels are looked at with all pilot rays.
+A sensor with a tick has to be looked at in each window, since things move by pixels from one tick to the next, but most
+pixels show the same in all windows of a block. A part of the pilot's rays is enough to see that in an *even* pixel,
+whose rays all see the same light: whatever comes is brighter or darker. Where rays differ, as at an edge or in a
+penumbra, a small change turns few of them, and such pixels are looked at with all pilot rays.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.rng import Stream
+from hesim_render.sources.render.change_driven.neighbours import Sites
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.windows import Windows
 
-#: Rays of the detector, and how many times as many pilot rays make it worth its rays.
-DETECTOR_RAYS, WORTH = 8, 4
-#: Sets of rays between which windows take turns, so that what one misses is seen a window later.
-_SETS = 2
+#: Rays of the detector.
+DETECTOR_RAYS = 8
 #: Largest scatter of single rays of an even pixel, in wanted errors; with 1 or 4, errors and rays are the same.
 _EVEN = np.float32(2.0)
 #: Relative differences of fluxes that rounding explains, and differences over the wanted error that count as none.
 _ROUNDING, _SAME = np.float32(1e-5), np.float32(0.2)
+#: Maps the flux of each site to the wanted error of a pair, both [site], e⁻/s.
+Wanted = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 
-def least_change(
-    flux: NDArray[np.float32], wanted: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None
-) -> NDArray[np.float32]:
+def least_change(flux: NDArray[np.float32], wanted: Wanted | None) -> NDArray[np.float32]:
     """Smallest change of the pilot's flux that means that a pixel shows something new, [site], e⁻/s.
 
     Parameters
@@ -44,87 +42,95 @@ def least_change(
     return least if wanted is None else np.maximum(least, _SAME * wanted(flux))
 
 
-@dataclass(frozen=True)
-class FirstLook:
-    """What the pilot saw in the first window, arrays [site].
+def _better(seen: PilotFlux) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Flux by the estimator that scatters less, and its scatter, e⁻/s."""
+    controlled = seen.controlled_scatter <= seen.plain_scatter
+    flux = np.where(controlled, seen.controlled, seen.plain)
+    return flux, np.where(controlled, seen.controlled_scatter, seen.plain_scatter)
 
-    Parameters
-    ----------
-    controlled : estimator that scatters less, see `DiffuseIntegrator`.
-    even : True where all rays see the same.
-    least : smallest change that counts, e⁻/s.
-    """
 
-    controlled: NDArray[np.bool_]
-    even: NDArray[np.bool_]
-    least: NDArray[np.float32]
-
-    @classmethod
-    def of(
-        cls,
-        flux: NDArray[np.float32],
-        first: PilotFlux,
-        wanted: Callable[[NDArray[np.float32]], NDArray[np.float32]],
-    ) -> FirstLook:
-        """From the statistics of the first window, its flux by the better estimator, and wanted errors, e⁻/s."""
-        controlled = first.controlled_scatter <= first.plain_scatter
-        scatter = np.where(controlled, first.controlled_scatter, first.plain_scatter)
-        return cls(controlled, scatter <= _EVEN * wanted(flux), least_change(flux, wanted))
-
-    def at(self, place: NDArray[np.int64] | NDArray[np.bool_]) -> FirstLook:
-        """Those of some sites."""
-        return FirstLook(self.controlled[place], self.even[place], self.least[place])
+def _turns(sites: Sites, place: NDArray[np.int64], count: int) -> Iterator[NDArray[np.bool_]]:
+    """Windows in which each set of rays looks at the sites at some places, [window, place]; the first one always."""
+    if sites.board is None:
+        # two sets, so that what one misses is seen a window later
+        for one in range(2):
+            turn = np.zeros((count, place.size), np.bool_)
+            turn[[0, *range(1 + one, count - 1, 2)]] = True
+            yield turn
+        return
+    # the fields of a chequered board; which of them is the sequence of Thue and Morse, with which no motion keeps pace
+    which = np.array([window.bit_count() % 2 for window in range(count)], np.bool_)
+    turn = which[:, None] ^ sites.board.odd[place]
+    # what comes between the last look of few rays and that of all would go unseen
+    turn[[0, count - 2]], turn[-1] = True, False
+    yield turn
 
 
 def windows_with_changes(
     tracer: PairTracer,
-    index: NDArray[np.uint32],
+    sites: Sites,
     numbers: NDArray[np.int64],
     windows: Windows,
-    first: FirstLook,
+    first: PilotFlux,
+    near: NDArray[np.bool_],
+    wanted: Wanted,
     width_px: float,
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Windows between the first and the last one that are refined, in order of windows.
+) -> NDArray[np.bool_]:
+    """Windows between the first and the last one in which the pilot looks with all its rays, [window, site].
 
-    Each is compared with the first window, by the same rays. It counts if it, or the one before or after it, differs;
-    of pixels that are not even, all windows count.
+    Few rays look at sites that are even in the first window: where pixels lie on no lattice in each window, by two
+    sets of rays in turn, else by one set in about every second window of a site. The pilot looks where they differ from
+    what they saw last, or among each other, and in the windows before and after. Sites that are not even in the first
+    window are looked at in all windows.
 
     Parameters
     ----------
     tracer : traces the rays, which have random numbers of their own.
-    index : [n], numbers of the sites on the full sensor.
-    numbers : [w, n], window number of each site.
+    sites : pixels with their neighbours.
+    numbers : [window, site], window number of each site; three windows at least.
     windows : all windows.
-    first : what the pilot saw in the first window.
+    first : what the pilot saw in the first window, [site].
+    near : [site], True where anything may change.
+    wanted : wanted error of each site.
     width_px : width of the area in which the rays start, px.
-
-    Returns
-    -------
-    window, place : [k] each, number of the row of `numbers`, and place in `index`.
     """
-    count = numbers.shape[0]
-    differs = np.zeros(numbers.shape, np.bool_)
-    differs[:, ~first.even] = True
-    place = np.flatnonzero(first.even)
-    least, controlled = first.least[place], first.controlled[place]
-    for number in range(_SETS):
-        own = np.arange(1 + number, count - 1, _SETS)
-        if own.size == 0 or place.size == 0:
-            continue
-        # the first window, and those that have its turn
-        looked_at = np.append(0, own)
-        seen = tracer.pilot(
-            *(np.tile(index[place], looked_at.size), numbers[np.ix_(looked_at, place)].ravel(), windows),
-            *(DETECTOR_RAYS, width_px, Stream.RENDER_DETECTOR),
+    count, size = numbers.shape
+    flux, scatter = _better(first)
+    even = near & (scatter <= _EVEN * wanted(flux))
+    place = np.flatnonzero(even)
+    # [window, site]; `seen` where few rays have looked
+    new, seen = np.zeros((2, count, size), np.bool_)
+    for number, turn in enumerate(_turns(sites, place, count)):
+        window, column = np.nonzero(turn)
+        site = place[column]
+        got = tracer.pilot(
+            *(sites.index[site], numbers[window, site], windows, DETECTOR_RAYS, width_px, Stream.RENDER_DETECTOR),
             repeat=number,
         )
-        # [window, site]
-        flux = np.where(controlled, *(v.reshape(looked_at.size, -1) for v in (seen.controlled, seen.plain)))
-        differs[np.ix_(own, place)] = np.abs(flux[1:] - flux[0]) > least
-    # the other set of rays may have missed in one window what it shows in the next
-    near = differs.copy()
-    near[1:] |= differs[:-1]
-    near[:-1] |= differs[1:]
-    near[[0, -1]] = False
-    window, which = np.nonzero(near)
-    return window, which
+        flux_there, scatter_there = _better(got)
+        # what this set saw of each site the last time, and when
+        last, when = np.zeros(size, np.float32), np.zeros(size, np.int64)
+        ends = np.searchsorted(window, np.arange(count + 1))
+        for now, (begin, end) in enumerate(pairwise(ends.tolist())):
+            if begin == end:
+                continue
+            some, level, spread = site[begin:end], last.copy(), np.zeros(size, np.float32)
+            level[some], spread[some] = flux_there[begin:end], scatter_there[begin:end]
+            if now:
+                differs = (np.abs(level - last) > least_change(last, wanted)) | (spread > _EVEN * wanted(level))
+                new[now, some], seen[now, some] = differs[some], True
+                if sites.board is not None:
+                    # in windows since the last look, in which these rays did not look
+                    for between in range(1, now):
+                        new[between] |= differs & (when < between)
+            last, when[some] = level, now
+    out = new.copy()
+    out[1:] |= new[:-1]
+    out[:-1] |= new[1:]
+    if sites.board is not None:
+        # neighbours look in the windows in which a site is not looked at
+        for each in range(1, count - 1):
+            out[each] |= sites.board.near(new[each] & seen[each], 1) & ~seen[each] & even
+    out |= near & ~even
+    out[[0, -1]] = False
+    return out

@@ -81,7 +81,7 @@ def difference_of(
     scatter = np.sqrt(np.float32(0.5) * (square[here] + sites.mean(square))) / _SMALLER
     # What these rays can not have seen: a small part of the light that changed, the larger the fewer rays looked.
     # a listed pixel with neighbours was looked at by the rays of 3 × 3 pixels
-    looked = tuning.lone_pilot_rays if sites.shape is None else 9 * tuning.pilot_rays
+    looked = tuning.lone_pilot_rays if sites.apart else 9 * tuning.pilot_rays
     open_flux = pilot.unshadowed[window][here]
     scatter = np.hypot(scatter, np.float32(tuning.unseen_change / looked**0.5) * open_flux)
     # the error of the other window comes on top of it

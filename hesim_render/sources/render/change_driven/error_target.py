@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.units import S_PER_US
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.change_driven.neighbours import Lattice
 
 #: Use of a pixel: "events" is a window of an event pixel; "any" is a frame exposure, or a window where there is none.
 Role = Literal["any", "events"]
@@ -83,6 +84,27 @@ class Noise:
 
     def is_apart(self, role: Role) -> bool:
         """True if pixels of a role have no direct neighbours of that role: fewer than half of all pixels have it."""
+        return 2 * len(self._places(role)) < self._position.size
+
+    def lattice(self, role: Role) -> Lattice | None:
+        """The pixels of a role, all pixels where they are not apart; None where they lie on no regular lattice."""
+        geometry, places = self._sensor.spec.geometry, self._places(role)
+        if not self.is_apart(role):
+            return Lattice.whole(geometry.rows, geometry.cols)
+        first, step, counts = [], [], []
+        for axis, size in enumerate((geometry.rows, geometry.cols)):
+            tile, own = self._position.shape[axis], sorted({place[axis] for place in places})
+            distance, rest = divmod(tile, len(own))
+            if rest or any(each != own[0] + k * distance for k, each in enumerate(own)):
+                return None
+            first.append(own[0])
+            step.append(distance)
+            counts.append(len(range(own[0], size, distance)))
+        if len(places) * step[0] * step[1] != self._position.size:
+            return None
+        return Lattice(counts[0], counts[1], (first[0], first[1]), (step[0], step[1]), geometry.cols)
+
+    def _places(self, role: Role) -> list[tuple[int, int]]:
+        """Places of a role in the tile."""
         spec = self._sensor.spec
-        counted = spec.positions("evs" if role == "events" or spec.aps is None else "aps")
-        return 2 * len(counted) < self._position.size
+        return spec.positions("evs" if role == "events" or spec.aps is None else "aps")

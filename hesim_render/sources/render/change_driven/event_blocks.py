@@ -22,6 +22,8 @@ from hesim_render.sources.render.change_driven.windows import Windows
 #: Largest number of intervals of a block of an asynchronous sensor. The last window of each block is rendered at all
 #: pixels, so that fewer blocks cost less; of a band of pixels, the plan of all windows is held in memory.
 INTERVALS = 64
+#: Part of the pixels that may be constant and yet be traced in each block, so that the first pilot of all goes on.
+FEW = 1 / 256
 
 
 class Blocks:
@@ -36,6 +38,7 @@ class Blocks:
     Attributes
     ----------
     alive : places of the pixels that may change.
+    own : places of these among the pixels that `take` gives: all of them, or all pixels, where few are constant.
     base : [1, n], flux of all pixels in the anchor of the first window.
     """
 
@@ -50,9 +53,12 @@ class Blocks:
         # values of the anchor are no samples of the sensor
         renderer.counts.values -= pixel.size
         self.alive = np.flatnonzero(~renderer.still("events").known[pixel])
-        known = self.base.at(self.alive)
-        if self.alive.size == sum(band.place.size for band, _ in kept):
-            # all pixels may change, so these bands and their pilots go on
+        self.own, known = np.arange(self.alive.size), self.base.at(self.alive)
+        kept_pixels = sum(band.place.size for band, _ in kept)
+        if kept_pixels == pixel.size and pixel.size - self.alive.size <= FEW * pixel.size:
+            self.own, known = self.alive, self.base
+        # all pixels that may change, or nearly only these: their bands and pilots go on
+        if known.error.shape[1] == kept_pixels:
             pilots = [pilot for _, pilot in kept]
             self._bands = [band for band, _ in kept]
         else:
@@ -68,7 +74,7 @@ class Blocks:
         self._last = known
 
     def take(self, block: Block) -> BlockFlux:
-        """Flux of the pixels that may change."""
+        """Flux of the pixels that may change; with that of the others where few are constant."""
         renderer, windows = self._renderer, Windows(block.begin_us, block.end_us)
         # the block begins with the window that ended the one before, whose flux is known
         is_next = self._time == (block.begin_us[0], block.end_us[0])
@@ -106,7 +112,7 @@ class Blocks:
             known = what.rendered.copy()
             known[followed.window, followed.pixel] = True
             parts.append((band.place, Knots.of(flux, known, centre)))
-        out = BlockFlux(self.alive.size, parts)
+        out = BlockFlux(self._last.half_a.shape[1], parts)
         # where a block goes on after the run, its last window may be unknown
         is_whole = bool(block.wanted[-1])
         self._time = (float(block.begin_us[-1]), float(block.end_us[-1])) if is_whole else None

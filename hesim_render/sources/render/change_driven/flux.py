@@ -328,16 +328,17 @@ class ChangeDrivenFlux:
         work: Blocks | None = None
         for block in blocks:
             if pixels.size == 0 or self._is_dark:
-                alive, base, flux = np.empty(0, np.int64), Flux.zeros(1, pixels.size), BlockFlux(0, [])
+                alive = own = np.empty(0, np.int64)
+                base, flux = Flux.zeros(1, pixels.size), BlockFlux(0, [])
             else:
                 work = work or Blocks(self._renderer, pixels, block)
-                flux, alive, base = work.take(block), work.alive, work.base
+                flux, alive, own, base = work.take(block), work.alive, work.own, work.base
             for window in np.flatnonzero(block.wanted):
                 self.counts.values += pixels.size
                 # constant pixels keep the flux of the anchor; those that may change have that of this window
                 values = [part[0].copy() for part in base.arrays]
                 for whole, part in zip(values, flux.at(int(window)).arrays, strict=True):
-                    whole[alive] = part[0]
+                    whole[alive] = part[0, own]
                 half_a, half_b = types.Float(values[0]), types.Float(values[1])
                 require_finite(half_a, half_b, self._scene, self.sensor.layout, pixels)
                 yield Sample(half_a, half_b, values[2])

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.sources.render.change_driven.anchor import anchor_us, period_us
+from hesim_render.sources.render.change_driven.event_blocks import FEW
 from hesim_render.sources.renderer import Demand, Estimate
 
 if TYPE_CHECKING:
@@ -61,11 +62,14 @@ def forecast(source: ChangeDrivenFlux, demand: Demand) -> Estimate:
         ]
         each, compared, anchors, pilots = np.mean(counts, axis=0)
         # all pixels are rendered in the first anchor, and in later ones those that are compared with it
-        first = source.foretell(patch, *anchor, "events", is_anchor=True)[[0, 3]].sum()
+        own, _, _, pilot = source.foretell(patch, *anchor, "events", is_anchor=True)
+        first = own + pilot
         # the first window of the first block belongs to no block before it, and may be the anchor itself
         begin = 0.0
         if (begin_us, end_us) != (every[0].begin_us[0], every[0].end_us[0]):
             begin = source.foretell(moving, every[0].begin_us[:1], every[0].end_us[:1], "events")[0]
+        # where nearly all may change, the pilot of the first anchor goes on
+        begin -= pilot if 1 - alive_part <= FEW else 0.0
         share = np.mean([np.ptp(block.end_us) / period_us(block.end_us) for block in chosen])
         more_anchors = max(0.0, float(np.ceil(demand.blocks.count * share)) - 1)
         rest = anchors * more_anchors + compared * (1 + more_anchors) + (each + pilots) * demand.blocks.count

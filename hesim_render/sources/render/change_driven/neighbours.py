@@ -14,54 +14,129 @@ REACH = 3
 
 
 @dataclass(frozen=True)
+class Lattice:
+    """Pixels of a role on the mosaic of the full sensor, where they lie on a regular lattice.
+
+    Parameters
+    ----------
+    rows, cols : number of rows and columns of the lattice.
+    first : row and column of its first pixel on the full sensor.
+    step : distance of its rows, and of its columns, pixels.
+    sensor_cols : columns of the full sensor.
+    """
+
+    rows: int
+    cols: int
+    first: tuple[int, int]
+    step: tuple[int, int]
+    sensor_cols: int
+
+    @classmethod
+    def whole(cls, rows: int, cols: int) -> Lattice:
+        """All pixels of a sensor."""
+        return cls(rows, cols, (0, 0), (1, 1), cols)
+
+    def place(self, index: NDArray[np.uint32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Row and column on the lattice of some of its pixels."""
+        row, col = np.divmod(index.astype(np.int64), self.sensor_cols)
+        return (row - self.first[0]) // self.step[0], (col - self.first[1]) // self.step[1]
+
+    def index(self, row: NDArray[np.int64], col: NDArray[np.int64]) -> NDArray[np.uint32]:
+        """Numbers on the full sensor of the pixels in some rows and columns of the lattice."""
+        number = (row * self.step[0] + self.first[0]) * self.sensor_cols + col * self.step[1] + self.first[1]
+        return number.astype(np.uint32)
+
+
+@dataclass(frozen=True)
+class Board:
+    """A rectangle of a lattice, some fields of which are sites.
+
+    Parameters
+    ----------
+    shape : rows and columns.
+    cell : [m], places of the sites in the rectangle, in row-major order.
+    odd : [m], True where row and column on the lattice add up to an odd number, as on a chequered board.
+    """
+
+    shape: tuple[int, int]
+    cell: NDArray[np.int64]
+    odd: NDArray[np.bool_]
+
+    def image(self, values: NDArray, margin: int, empty: float | bool) -> NDArray:
+        """Values of the sites [m] in the rectangle, with a margin around; `empty` in all other fields."""
+        rows, cols = self.shape
+        image = np.full((rows + 2 * margin, cols + 2 * margin), empty, values.dtype)
+        inner = np.full(rows * cols, empty, values.dtype)
+        inner[self.cell] = values
+        image[margin : margin + rows, margin : margin + cols] = inner.reshape(rows, cols)
+        return image
+
+    def near(self, marked: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+        """True at sites [m] at most `radius` fields away from a marked one [m], also diagonally."""
+        image = self.image(marked, radius, False)
+        rows, cols = self.shape
+        across = image[:, :cols].copy()
+        for shift in range(1, 2 * radius + 1):
+            across |= image[:, shift : shift + cols]
+        within = across[:rows].copy()
+        for shift in range(1, 2 * radius + 1):
+            within |= across[shift : shift + rows]
+        return within.ravel()[self.cell]
+
+
+@dataclass(frozen=True)
 class Sites:
     """Listed pixels and their neighbours on the mosaic of the full sensor, independent of the read-out region.
 
     Statistics over a pixel's neighbourhood are therefore equal to the bit for a crop and for the full sensor. Sums add
-    their terms in the same order.
+    their terms in the same order. Pixels that lie apart have no statistics of others; what happens to those around them
+    on the lattice may be known all the same.
 
     Parameters
     ----------
     index : [m], numbers on the full sensor, increasing.
     listed : [n], places of the listed pixels in `index`, in the order of the list.
-    shape : rows and columns of the rectangle around all sites; None where the listed pixels have no neighbours.
-    cell : [m], places of the sites in that rectangle.
+    board : the sites on their lattice; None if there is none.
+    apart : True where the listed pixels have no direct neighbours.
     """
 
     index: NDArray[np.uint32]
     listed: NDArray[np.int64]
-    shape: tuple[int, int] | None = None
-    cell: NDArray[np.int64] | None = None
+    board: Board | None = None
+    apart: bool = True
     _count: list[NDArray[np.float32]] = field(default_factory=list)
 
     @classmethod
     def alone(cls, pixel: NDArray[np.uint32]) -> Sites:
-        """Listed pixels without neighbours."""
+        """Listed pixels without neighbours, on no lattice."""
         index, listed = np.unique(pixel, return_inverse=True)
         return cls(index, listed.astype(np.int64))
 
     @classmethod
-    def around(cls, pixel: NDArray[np.uint32], rows: int, cols: int) -> Sites:
-        """Listed pixels with their neighbours up to `REACH` away, on a full sensor of the given size."""
+    def around(cls, pixel: NDArray[np.uint32], lattice: Lattice) -> Sites:
+        """Listed pixels with their neighbours up to `REACH` away, or, where they lie apart, with the next ones."""
+        apart = lattice.step != (1, 1)
+        reach = 1 if apart else REACH
         # the smallest rectangle [row, col] with all listed pixels and their neighbours, cut to the sensor
-        row, col = np.divmod(pixel.astype(np.int64), cols)
-        top, bottom = max(0, int(row.min()) - REACH), min(rows, int(row.max()) + REACH + 1)
-        left, right = max(0, int(col.min()) - REACH), min(cols, int(col.max()) + REACH + 1)
+        row, col = lattice.place(pixel)
+        top, bottom = max(0, int(row.min()) - reach), min(lattice.rows, int(row.max()) + reach + 1)
+        left, right = max(0, int(col.min()) - reach), min(lattice.cols, int(col.max()) + reach + 1)
         shape = bottom - top, right - left
-        wanted = np.zeros((shape[0] + 2 * REACH, shape[1] + 2 * REACH), np.bool_)
-        inner = wanted[REACH:-REACH, REACH:-REACH]
+        wanted = np.zeros((shape[0] + 2 * reach, shape[1] + 2 * reach), np.bool_)
+        inner = wanted[reach:-reach, reach:-reach]
         inner[row - top, col - left] = True
         # sites are the cells of the rectangle with a listed pixel within reach, in row-major order
         near = np.zeros(shape, np.bool_)
-        for down in range(2 * REACH + 1):
-            for right_ in range(2 * REACH + 1):
+        for down in range(2 * reach + 1):
+            for right_ in range(2 * reach + 1):
                 near |= wanted[down : down + shape[0], right_ : right_ + shape[1]]
         # number of each cell among the sites, where it is one
         cell = np.flatnonzero(near)
         place = np.cumsum(near.ravel()) - 1
         site_row, site_col = np.divmod(cell, shape[1])
-        index = ((site_row + top) * cols + site_col + left).astype(np.uint32)
-        return cls(index, place[(row - top) * shape[1] + col - left], shape, cell)
+        board = Board(shape, cell, (site_row + top + site_col + left) % 2 == 1)
+        index = lattice.index(site_row + top, site_col + left)
+        return cls(index, place[(row - top) * shape[1] + col - left], board, apart)
 
     @property
     def size(self) -> int:
@@ -69,7 +144,7 @@ class Sites:
 
     def mean(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Mean of `values` [m] over the sites in the 3×3 neighbourhood of each listed pixel, [n]."""
-        if self.shape is None:
+        if self.apart:
             return values[self.listed]
         # near the rim of the sensor there are fewer than nine
         if not self._count:
@@ -77,16 +152,17 @@ class Sites:
         return self._sum(values) / self._count[0]
 
     def _sum(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        image = self._image(values, 1, 0.0)
+        assert self.board is not None
+        image = self.board.image(values, 1, 0.0)
         across = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
         return self._at_listed(across[:-2] + across[1:-1] + across[2:])
 
     def most(self, values: NDArray, radius: int) -> NDArray:
         """Largest of `values` [m] at most `radius` pixels away from each listed pixel, also diagonally, [n]."""
-        if self.shape is None:
+        if self.apart or self.board is None:
             return values[self.listed]
         lowest = False if values.dtype == np.bool_ else -np.inf
-        image = self._image(values, radius, lowest)
+        image = self.board.image(values, radius, lowest)
         # along rows, then along columns: 4r steps in place of (2r + 1)²
         cols, rows = image.shape[1] - 2 * radius, image.shape[0] - 2 * radius
         across = image[:, :cols]
@@ -99,30 +175,11 @@ class Sites:
 
     def near(self, marked: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
         """True at sites [m] at most `radius` pixels away from a marked one [m], also diagonally."""
-        if self.shape is None or self.cell is None:
-            return marked
-        image = self._image(marked, radius, False)
-        rows, cols = self.shape
-        across = image[:, :cols].copy()
-        for shift in range(1, 2 * radius + 1):
-            across |= image[:, shift : shift + cols]
-        within = across[:rows].copy()
-        for shift in range(1, 2 * radius + 1):
-            within |= across[shift : shift + rows]
-        return within.ravel()[self.cell]
-
-    def _image(self, values: NDArray, margin: int, empty: float | bool) -> NDArray:
-        assert self.shape is not None
-        rows, cols = self.shape
-        image = np.full((rows + 2 * margin, cols + 2 * margin), empty, values.dtype)
-        inner = np.full(rows * cols, empty, values.dtype)
-        inner[self.cell] = values
-        image[margin : margin + rows, margin : margin + cols] = inner.reshape(rows, cols)
-        return image
+        return marked if self.apart or self.board is None else self.board.near(marked, radius)
 
     def _at_listed(self, image: NDArray) -> NDArray:
-        assert self.cell is not None
-        return image.ravel()[self.cell[self.listed]]
+        assert self.board is not None
+        return image.ravel()[self.board.cell[self.listed]]
 
 
 def turns(row: NDArray[np.integer], window: NDArray[np.integer]) -> NDArray[np.int64]:

@@ -7,9 +7,8 @@ a change of the scene, not of the rays.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +17,11 @@ from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.aim import Aims
 from hesim_render.sources.render.change_driven.change_detector import (
     DETECTOR_RAYS,
-    WORTH,
-    FirstLook,
-    least_change,
+    Wanted,
     windows_with_changes,
 )
-from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
+from hesim_render.sources.render.change_driven.looks import CHANGES, STATISTICS, Looks
+from hesim_render.sources.render.change_driven.neighbours import Sites
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux, PilotRays, joined
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.small_objects import Look
@@ -145,7 +143,7 @@ def take_pilot(
     anchored: Anchored | None = None,
     known: PilotFlux | None = None,
     stride: int = 1,
-    wanted: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
+    wanted: Wanted | None = None,
 ) -> tuple[Pilot, NDArray[np.bool_]]:
     """Trace the pilot pass.
 
@@ -182,57 +180,23 @@ def take_pilot(
         first, own_rays = tracer.pilot_rays(sites.index, numbers[0], *given, span_us=span_us, before=before)
     knows = tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
     near = first.met if knows else np.ones(sites.size, np.bool_)
-    controlled, plain, *others = (np.repeat(values[None], count, axis=0) for values in _tables(first))
-    pilot = Pilot(controlled, plain, others[0], others[1], others[2])
-    moving = np.flatnonzero(near)
-    scatters = np.zeros((2, count, sites.size), np.float32)
-    # where nothing is near, the last window has the difference of the first one to the anchor
-    scatters[0, [0, -1]], scatters[1, [0, -1]] = first.controlled_change, first.plain_change
-    if count > 1 and moving.size:
 
-        def look(window: NDArray[np.int64], place: NDArray[np.int64]) -> None:
-            """Trace sites in windows other than the first."""
-            compared = None
-            if anchored is not None and own_rays is not None:
-                compared = joined(own_rays, anchored.rays), place + np.where(window == count - 1, sites.size, 0)
-            more = tracer.pilot(sites.index[place], numbers[window, place], *given, before=compared)
-            tables = zip(
-                (*_tables(pilot), *scatters), (*_tables(more), more.controlled_change, more.plain_change), strict=True
-            )
-            for values, values_there in tables:
-                values[window, place] = values_there
+    def look(window: NDArray[np.int64], place: NDArray[np.int64]) -> PilotFlux:
+        """Trace sites in windows other than the first."""
+        compared = None
+        if anchored is not None and own_rays is not None:
+            compared = joined(own_rays, anchored.rays), place + np.where(window == count - 1, sites.size, 0)
+        return tracer.pilot(sites.index[place], numbers[window, place], *given, before=compared)
 
-        looks = np.append(np.arange(0, count - 1, stride), count - 1)
-        if stride == 1 and rays >= WORTH * DETECTOR_RAYS and wanted is not None:
-            # few rays tell which windows show anything new; the last one is the first of the next block
-            first_look = FirstLook.of(pilot.flux_of(0), first, wanted).at(moving)
-            window, place = windows_with_changes(
-                tracer, sites.index[moving], numbers[:, moving], windows, first_look, width_px
-            )
-            look(window, moving[place])
-            look(np.full(moving.size, count - 1), moving)
+    looks = Looks(first, count, near, look)
+    if count > 1 and near.any():
+        if stride == 1 and rays > DETECTOR_RAYS and wanted is not None and count > 2:
+            # few rays tell which windows show anything new
+            looks.wherever(windows_with_changes(tracer, sites, numbers, windows, first, near, wanted, width_px))
         else:
-            look(np.repeat(looks[1:], moving.size), np.tile(moving, looks.size - 1))
-        spans = [span for span in pairwise(looks.tolist()) if span[1] - span[0] > 1]
-        while spans:
-            windows_of, places_of = [], []
-            for early, late in spans:
-                # what shows the same in two looks, in all pixels around, has kept its light between them
-                is_controlled = pilot.controlled_scatter[early] <= pilot.plain_scatter[early]
-                begin, end = (np.where(is_controlled, pilot.controlled[k], pilot.plain[k]) for k in (early, late))
-                changed = np.abs(end - begin) > least_change(begin, wanted)
-                busy = np.flatnonzero(sites.near(changed, REACH - 1) & near)
-                between = slice(early + 1, late)
-                for values in _tables(pilot):
-                    values[between] = values[early]
-                for values in scatters:
-                    values[between] = values[early] if early else 0  # the first window is compared with the anchor
-                windows_of.append(np.full(busy.size, (early + late) // 2))
-                places_of.append(busy)
-            # where something changed, one more look half way between
-            look(np.concatenate(windows_of), np.concatenate(places_of))
-            halves = [half for a, b in spans for half in ((a, (a + b) // 2), ((a + b) // 2, b))]
-            spans = [span for span in halves if span[1] - span[0] > 1]
+            looks.every(stride, sites, wanted)
+    tables = [looks.tables[name] for name in STATISTICS]
+    pilot = Pilot(tables[0], tables[1], tables[2], tables[3], tables[4])
     change = None
     if anchored is not None:
         means = [values - values[:1] for values in (pilot.controlled, pilot.plain)]
@@ -240,7 +204,7 @@ def take_pilot(
             means, (pilot.controlled, pilot.plain), (anchored.flux.controlled, anchored.flux.plain), strict=True
         ):
             mean[[0, -1]] = values[[0, -1]] - other
-        change = Change(means[0], means[1], scatters[0], scatters[1])
+        change = Change(means[0], means[1], looks.tables[CHANGES[0]], looks.tables[CHANGES[1]])
     near_by = [(window, one) for window, row in enumerate(extra_looks) for one in row if one.place.size]
     aims = Aims.of([(window, *one.aims) for window, one in near_by if one.aims is not None], sites.size)
     refined = _refine(tracer, sites, windows, numbers, pilot, width_px, near_by, aims)
@@ -298,10 +262,4 @@ def _refine(
 
 
 def _tables(statistics: Pilot | PilotFlux) -> tuple[NDArray[np.float32], ...]:
-    return (
-        statistics.controlled,
-        statistics.plain,
-        statistics.controlled_scatter,
-        statistics.plain_scatter,
-        statistics.unshadowed,
-    )
+    return tuple(getattr(statistics, name) for name in STATISTICS)

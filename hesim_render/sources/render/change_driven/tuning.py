@@ -123,8 +123,8 @@ class Tuning:
     audit_pilot_rays : rays, C. Pilot rays of the audit. Without (as few as `pilot_rays`): the plan of the reference is
         as poor as that of the values it judges.
     least_audit_rays : rays, C. Least number of rays of a reference value. Without: as above.
-    audit_ray_weight : wanted errors of the audit, C. As `ray_weight`. Without (as large): the reference is no better
-        than the values it judges.
+    audit_ray_weight : wanted errors of the audit, C. As `ray_weight`; these errors are half of the run's. Without
+        (twice as large): the reference is no better than the values it judges.
     edge_least_audit_rays : rays, C. As `edge_least_rays`, in the audit. Without (0): most pairs of an audit hold no
         edge, and their decision rays cost more than edges save.
     most_audit_times : traces, C. Largest number of traces of one value. Without: a few values take the time of the
@@ -176,9 +176,9 @@ class Tuning:
     unseen_change: float = 0.5
     audit_pilot_rays: int = 64
     least_audit_rays: int = 64
-    audit_ray_weight: float = 0.8
+    audit_ray_weight: float = 2.0
     edge_least_audit_rays: int = 1024
-    most_audit_times: int = 8
+    most_audit_times: int = 4
 
     def at(self, quality: float) -> Tuning:
         """The constants for a quality: a better one than 0.5 moves the largest number of rays of a pair."""
