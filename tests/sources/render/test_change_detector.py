@@ -66,8 +66,8 @@ def light_of(sites=SITES, **changes):
 
 
 def wanted_error(flux):
-    """A twentieth of the light beyond 600."""
-    return np.where(flux > 600, WANTED * flux / 800, 15).astype(np.float32)
+    """In proportion to the light, less below 796."""
+    return np.where(flux > 796, WANTED * flux / 800, np.where(flux > 600, 20, 15)).astype(np.float32)
 
 
 def found_by(light, sites=None, first=(59.0, 70.0), near=True, spread=None):
@@ -98,6 +98,8 @@ def test_what_stays_after_a_change_is_not_looked_at_again():
     _, found = found_by(light_of(s3=(4, COUNT, 300.0), s5=(4, COUNT, -100.0)))
     # window 4 by one set, 5 by the other, and those beside
     assert windows_of(found, 3) == windows_of(found, 5) == [3, 4, 5, 6]
+    # 5 less are no change for what was seen before, though the error that is wanted there is smaller
+    assert not windows_of(found_by(light_of(s3=(4, COUNT, -5.0)))[1], 3)
     # beyond the change a fifth of the error wanted there counts: 8.25 of 41.25
     for by, windows in ((8.0, [3, 4, 5, 6]), (8.5, [3, 4, 5, 6, 7, 8])):
         light = light_of(s3=(4, COUNT, 300.0))
