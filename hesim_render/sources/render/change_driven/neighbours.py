@@ -20,7 +20,7 @@ class Lattice:
     Parameters
     ----------
     rows, cols : number of rows and columns of the lattice.
-    first : row and column of its first pixel on the full sensor.
+    first : row and column of its first pixel on the full sensor, each below the step.
     step : distance of its rows, and of its columns, pixels.
     sensor_cols : columns of the full sensor.
     """
@@ -39,7 +39,7 @@ class Lattice:
     def place(self, index: NDArray[np.uint32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Row and column on the lattice of some of its pixels."""
         row, col = np.divmod(index.astype(np.int64), self.sensor_cols)
-        return (row - self.first[0]) // self.step[0], (col - self.first[1]) // self.step[1]
+        return row // self.step[0], col // self.step[1]
 
     def index(self, row: NDArray[np.int64], col: NDArray[np.int64]) -> NDArray[np.uint32]:
         """Numbers on the full sensor of the pixels in some rows and columns of the lattice."""
