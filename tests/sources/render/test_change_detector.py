@@ -4,12 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_change_driven import fluxes
+from test_change_driven import ball_before_a_wall, fluxes
 from test_differences import shadow_scene
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.rng import Stream
+from hesim_render.sources.render.change_driven import event_blocks
 from hesim_render.sources.render.change_driven import pilot as pilots
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.change_detector import windows_with_changes
@@ -334,6 +335,21 @@ def test_rays_of_constant_pixels_count_as_those_of_pilots():
     band = SimpleNamespace(sites=SimpleNamespace(size=5, index=np.arange(5)), pilot_rays=8)
     AdaptiveRenderer.pilot_rays(own, band, SimpleNamespace(span_us=(0.0, 10.0)), (3.0, 9.0))
     assert own.counts.pilot_rays == 68
+
+
+def test_few_constant_pixels_go_on_with_the_pilot_of_all(monkeypatch):
+    """As many as are constant here, by force: the same flux to the bit, whose first pilot is traced once."""
+    sensor = hr.load_sensor("reference-mono", {"evs.threshold_mismatch_rel": 0.02}).crop(40, 24)
+    found = []
+    for few in (1.0, 0.0):
+        monkeypatch.setattr(event_blocks, "FEW", few)
+        source = ChangeDrivenFlux(ball_before_a_wall(), sensor, seed=4)
+        found.append((fluxes(source, 0, 6000), source.counts.pilot_rays))
+        constant = source.still_pixels(source.sensor.layout.evs_pixel.ravel())
+        assert 0.1 < constant.mean() < 0.9
+    (some, fewer), (every, most) = found
+    np.testing.assert_array_equal(some, every)
+    assert np.ptp(some, axis=0).max() > 0 and fewer != most
 
 
 def test_a_run_begins_with_the_flux_of_its_anchor():

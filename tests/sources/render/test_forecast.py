@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
+from hesim_render.mosaic.schedule import BlockSample, tick_blocks
 from hesim_render.sources.render.change_driven import forecast
+from hesim_render.sources.render.change_driven.anchor import anchor_us
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.renderer import Demand
 
 
 @pytest.mark.parametrize(("scene", "sensor", "region", "duration_us"), [
@@ -26,6 +29,42 @@ def test_samples_of_pixels_have_the_rays_of_all(scene, sensor, region, duration_
     assert max(part.size for part in samples) < 0.5 * pixels.size
     found = np.array([rays(part) for part in samples]) / rays(pixels)
     np.testing.assert_allclose(found, 1, atol=0.2)
+
+
+class Counted:
+    """A renderer of 800 pixels of which some may change: 70 rays of each in a block, 20 to compare with in its anchor,
+    5 of the flux there, 30 of pilots; 64 and 32 in the first anchor.
+    """
+
+    is_static, seed, sensor = False, 3, None
+
+    def __init__(self, constant):
+        self.constant = constant
+
+    def may_change(self, pixel, begin_us, end_us):
+        return pixel >= self.constant * pixel.size
+
+    def is_apart(self, role):
+        return True
+
+    def foretell(self, pixel, begin_us, end_us, role, until=None, is_anchor=False):
+        return np.array([64.0, 0, 0, 32]) if is_anchor else np.array([70.0, 20, 5, 30])
+
+    def rays_per_second(self):
+        return 1e7
+
+
+@pytest.mark.parametrize(("constant", "saved"), [(0.0, 32), (0.003, 32), (0.01, 0)])
+def test_the_first_pilot_goes_on_where_nearly_all_pixels_may_change(constant, saved):
+    """It is traced again for what may change where more than one pixel of 256 is constant."""
+    pixels = np.arange(800, dtype=np.uint32)
+    spec = hr.load_sensor("gen2").spec.evs
+    blocks = list(tick_blocks(spec, 0, 40_000))
+    demand = Demand(40_000, pixels, BlockSample(blocks, 1.0), np.empty(0, np.uint32), [])
+    source, alive = Counted(constant), 1 - np.ceil(constant * 800) / 800
+    first_is_anchor = anchor_us(blocks[0].begin_us, blocks[0].end_us) == (blocks[0].begin_us[0], blocks[0].end_us[0])
+    each = 96 + alive * ((0 if first_is_anchor else 70) - saved + 20 + (70 + 30) * len(blocks))
+    assert forecast.forecast(source, demand).rays == pytest.approx(800 * each)
 
 
 #: A plate flies past one corner of the picture; most of the wall never sees it.
