@@ -7,7 +7,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from hesim_render.core.errors import RangeError
 from hesim_render.core.guard import printable
@@ -58,18 +58,26 @@ def say(text: str) -> None:
 
 def silence_stdout() -> None:
     """Discard all further stdout, including text that Python still has to flush at its end."""
+    _silence(sys.stdout)
+
+
+def _silence(stream: TextIO) -> None:
     with contextlib.suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
+        os.dup2(nowhere, stream.fileno())
         os.close(nowhere)
 
 
 def complain(*lines: str) -> None:
-    """Print lines on stderr, each with the program's name; errors are ignored if stderr is closed."""
-    with contextlib.suppress(OSError, ValueError, AttributeError):
-        for line in lines:
-            sys.stderr.write(f"hesim-render: {printable(' '.join(line.split()))}\n")
-        sys.stderr.flush()
+    """Print lines on stderr, each with the program's name; errors are ignored where it is closed or full."""
+    with contextlib.suppress(ValueError, AttributeError):
+        try:
+            for line in lines:
+                sys.stderr.write(f"hesim-render: {printable(' '.join(line.split()))}\n")
+            sys.stderr.flush()
+        except OSError:
+            # what Python would flush at its end would change the exit status
+            _silence(sys.stderr)
 
 
 def summary(recording: Recording) -> str:
