@@ -186,7 +186,12 @@ def test_neighbours_of_a_tick_are_rendered_again_where_its_events_differ():
     reference, _ = audit._reference(units, np.zeros(2, bool), "eventful")
     assert sorted(looked) == [4, 5, 5, 6, 6, 7] and np.all(reference[:, 1] == 1e5)
     np.testing.assert_array_equal(reference[:, 0], step[:, 0])
-    # of units without events the window before is needed, of those that stand still the judged one alone
+    # of units that stand still the judged window is needed alone, whatever it shows
+    looked.clear()
+    audit._reference(units, np.array([False, True]), "eventful")
+    assert sorted(looked) == [5, 6, 6]
+    assert audit._tick_event(units, step, 2).tolist() == [1, 1] and not audit._tick_event(units, step, 0).any()
+    # of units without events the window before is needed
     looked.clear()
     audit._reference(units, np.array([True, False]), "calm")
     assert sorted(looked) == [5, 6, 6]
@@ -241,10 +246,13 @@ def test_an_audit_gives_up_where_its_rays_would_not_do(monkeypatch):
     truth[::2, :9] *= 1.5
     given_up = audited(truth, truth, 1, rays_each=40)
     assert given_up["verdict"] == "not shown" and 0.3 * 300_000 < given_up["rays"] < 0.6 * 300_000
-    monkeypatch.setattr(audit_module, "_is_hopeless", lambda shares, times: False)
+    times_left = []
+    monkeypatch.setattr(audit_module, "_is_hopeless", lambda shares, times: times_left.append(times))
     whole = audited(truth, truth, 1, rays_each=40)
     assert whole["verdict"] == "not shown" and 1 < whole["rays"] / 300_000 < 1.1
     assert whole["events"]["missed_at_most"] > whole["events"]["missed_wanted_at_most"]
+    # what is left over what was spent, from an eighth of all on
+    assert 3 < times_left[0] < 8 and min(times_left) >= 1 and times_left == sorted(times_left, reverse=True)
 
 
 class HalfStill(Given):

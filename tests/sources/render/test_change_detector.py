@@ -218,6 +218,10 @@ def test_a_pilot_of_many_rays_looks_where_few_see_a_change_and_at_the_end():
         tracer = Detected(light)
         pilot_by(tracer, rays, stride=stride)
         assert Stream.RENDER_DETECTOR not in {each[0] for each in tracer.traced}
+    # pixels with neighbours have sixteen
+    tracer = Detected(light)
+    pilot_by(tracer, 16)
+    assert Stream.RENDER_DETECTOR in {each[0] for each in tracer.traced}
 
 
 def test_windows_between_looks_show_what_the_one_before_does():
