@@ -309,9 +309,12 @@ def test_pixels_that_lie_apart_have_the_same_flux_in_a_crop():
     np.testing.assert_array_equal(every[..., inner.ravel()], some)
 
 
-def test_ticks_of_lone_pixels_keep_their_flux_with_a_detector(monkeypatch):
-    """A shadow moves over pixels that lie apart: the same flux to the bit but in a few pairs, for fewer pilot rays."""
-    sensor = hr.load_sensor("gen2", {"evs.threshold_mismatch_rel": 0.02}).crop(72, 48, 16, 8)
+@pytest.mark.parametrize(("name", "region"), [("gen2", (72, 48, 16, 8)), ("reference-mono", (44, 28, 7, 5))])
+def test_ticks_keep_their_flux_with_a_detector(monkeypatch, name, region):
+    """A shadow moves over pixels that lie apart, or side by side: the same flux to the bit but in a few pairs, for
+    fewer pilot rays.
+    """
+    sensor = hr.load_sensor(name, {"evs.threshold_mismatch_rel": 0.02}).crop(*region)
     found = []
     for rays in (8, 1000):
         monkeypatch.setattr(pilots, "DETECTOR_RAYS", rays)
