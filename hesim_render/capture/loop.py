@@ -16,6 +16,7 @@ from hesim_render.core.device_types import Float
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.schedule import (
+    BLOCK_CELLS,
     BLOCK_INTERVALS,
     CELL_US,
     Block,
@@ -146,7 +147,8 @@ class Capture:
         """Some of `event_blocks`, which stand for all of them; a long run has millions."""
         if self._stage is None:
             return BlockSample([], 1.0)
-        stretch_us = BLOCK_INTERVALS * (self._stage.noise.spec.tick_us or CELL_US)
+        tick_us = self._stage.noise.spec.tick_us
+        stretch_us = BLOCK_INTERVALS * tick_us if tick_us is not None else BLOCK_CELLS * CELL_US
         return sample_of_blocks(self._blocks_between, stretch_us, self._begin_us, self._duration_us, self._seed)
 
     @property

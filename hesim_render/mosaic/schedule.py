@@ -87,8 +87,10 @@ def exposures(spec: ApsSpec, rows: int, duration_us: int) -> list[Exposure]:
         result.append(exposure)
 
 
-#: Number of intervals between windows in a block; interpolation never crosses the border of a block.
+#: Number of intervals between ticks in a block; interpolation never crosses the border of a block.
 BLOCK_INTERVALS = 16
+#: Number of cells of sample times in a block, before it is cut where it has too many.
+BLOCK_CELLS = 32
 #: Number of stretches of time, of one block of ticks or of cells each, that stand for a run of more of them.
 _STRETCHES = 1024
 #: Sample times of sensors without a tick are computed in cells of this length, µs. Cells begin at its
@@ -135,7 +137,7 @@ def instant_blocks(
 ) -> Iterator[Block]:
     """Windows that end at the instants of a source, after one time and up to another.
 
-    The instants of every `BLOCK_INTERVALS` cells are cut into blocks of at most `intervals` intervals.
+    The instants of every `BLOCK_CELLS` cells are cut into blocks of at most `intervals` intervals.
 
     Parameters
     ----------
@@ -144,7 +146,7 @@ def instant_blocks(
     begin_us, end_us : the times, µs.
     intervals : largest number of intervals of a block.
     """
-    length = BLOCK_INTERVALS * CELL_US
+    length = BLOCK_CELLS * CELL_US
     for number in range(int(begin_us // length), -(-int(np.ceil(end_us)) // length)):
         instants = instants_us(number * length, (number + 1) * length)
         for first in range(0, instants.size - 1, intervals):

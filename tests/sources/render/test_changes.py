@@ -162,7 +162,7 @@ def test_a_plan_ends_at_the_first_window_after_the_run():
     shape = rendered.shape
     fitted = np.zeros(shape, bool)
     one = Plan(rendered, np.ones(shape, np.int16), rendered, *(np.ones(shape, np.float32) for _ in range(2)),
-               np.ones(shape, np.int16), Differences.none(*shape), fitted, ~rendered,
+               np.ones(shape, np.int16), Differences.none(*shape), fitted, ~rendered, ~rendered,
                np.ones(shape, np.float32))  # fmt: skip
     cut = np.array([[1, 1], [0, 1], [0, 0], [1, 0], [0, 1], [0, 0]], bool)
     np.testing.assert_array_equal(one.until(2).rendered, cut)

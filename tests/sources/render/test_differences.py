@@ -158,9 +158,11 @@ def test_pixels_with_small_objects_are_rendered_by_themselves():
 
 def test_anchors_lie_at_multiples_of_64_ms_or_of_four_blocks():
     begin = np.array([129_999.0, 130_099, 130_199])
-    assert anchor_us(begin, begin + 1) == (127_999, 128_000)
+    assert anchor_us(begin, begin + 1, False) == (127_999, 128_000)
     ticks = np.arange(17) * 2000.0 + 130_000  # a block of 32 ms
-    assert period_us(ticks) == 128_000 and anchor_us(ticks - 700, ticks) == (127_300, 128_000)
+    assert period_us(ticks, True) == 128_000 and anchor_us(ticks - 700, ticks, True) == (127_300, 128_000)
+    # blocks of instants have different lengths, and one period
+    assert period_us(ticks, False) == 64_000 and anchor_us(ticks + 1300, ticks + 2000, False) == (127_300, 128_000)
 
 
 @pytest.mark.parametrize("name", ["davis346", "imx636"])

@@ -62,7 +62,10 @@ def test_the_first_pilot_goes_on_where_nearly_all_pixels_may_change(constant, sa
     blocks = list(tick_blocks(spec, 0, 40_000))
     demand = Demand(40_000, pixels, BlockSample(blocks, 1.0), np.empty(0, np.uint32), [])
     source, alive = Counted(constant), 1 - np.ceil(constant * 800) / 800
-    first_is_anchor = anchor_us(blocks[0].begin_us, blocks[0].end_us) == (blocks[0].begin_us[0], blocks[0].end_us[0])
+    first_is_anchor = anchor_us(blocks[0].begin_us, blocks[0].end_us, False) == (
+        blocks[0].begin_us[0],
+        blocks[0].end_us[0],
+    )
     each = 96 + alive * ((0 if first_is_anchor else 70) - saved + 20 + (70 + 30) * len(blocks))
     assert forecast.forecast(source, demand).rays == pytest.approx(800 * each)
 

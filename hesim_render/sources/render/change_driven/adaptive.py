@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.distinct import distinct_columns
 from hesim_render.sources.render.change_driven.aim import PairAims
+from hesim_render.sources.render.change_driven.deep_shadow import deep_shadow
 from hesim_render.sources.render.change_driven.edge_courses import Courses, courses
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
 from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Band, Counts, Flux, Still
+from hesim_render.sources.render.change_driven.held_pairs import HeldPairs, held_pairs
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites, of_own_row, turns
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
@@ -48,6 +51,7 @@ class AdaptiveRenderer:
     index : [row · cols + col], number of each mosaic pixel on the full sensor.
     counts : work done so far.
     look_stride : windows from one look of the pilot to the next.
+    has_ticks : True if event pixels compare at a fixed tick.
     """
 
     def __init__(self, tracer: PairTracer, noise: Noise, quality: float, tuning: Tuning) -> None:
@@ -58,7 +62,8 @@ class AdaptiveRenderer:
         self.index = self._sensor.layout.full_index.ravel()
         evs, rays = self._sensor.spec.evs, tracer.rays
         # windows of an asynchronous sensor are so close that nothing moves far from one to the next
-        self.look_stride = tuning.look_stride if evs is not None and evs.tick_us is None else 1
+        self.has_ticks = evs is None or evs.tick_us is not None
+        self.look_stride = 1 if self.has_ticks else tuning.look_stride
         self.zoom = Zoom(
             tracer.view, tracer.camera, tracer.parts.groups, tracer.is_diffuse, tuning, rays.can_aim, rays.blur_px
         )
@@ -121,9 +126,18 @@ class AdaptiveRenderer:
             known,
             stride,
         )
-        piloted = take_pilot(*given, lambda flux: np.float32(band.quality) * band.unit(flux))
+
+        def wanted(flux: NDArray[np.float32]) -> NDArray[np.float32]:
+            return np.float32(band.quality) * band.unit(flux)
+
+        pilot, near = take_pilot(*given, wanted)
+        if band.apart and pilot.windows > 2:
+            # no neighbour tells when deep shadow ends
+            seen = pilot.steady_flux, pilot.unshadowed
+            deep = deep_shadow(self.tracer, band.sites, numbers, windows, seen, near, wanted, width, self.tuning)
+            pilot = replace(pilot, deep=deep)
         self.counts.pilot_rays += self.tracer.rays_done - before
-        return piloted
+        return pilot, near
 
     def pilot_rays(self, band: Band, windows: Windows, near_us: tuple[float, float] | None) -> Anchored:
         """Pilot of a band in the only window, with its rays, which say what comes near in an interval, µs."""
@@ -151,28 +165,48 @@ class AdaptiveRenderer:
 
     def follow(
         self, band: Band, windows: Windows, numbers: NDArray[np.int64], what: Plan
-    ) -> tuple[Plan, EdgeFit | None, Courses]:
-        """Follow edges from window to window: a plan without the windows between two fits of one edge, the fits, and
-        those windows; this traces decision rays.
+    ) -> tuple[Plan, EdgeFit | None, Courses, HeldPairs]:
+        """Follow edges from window to window, and hold what does not change beside them: a plan without the windows
+        between two fits of one edge and without held pairs, its fits, those windows, and those pairs; this traces
+        decision rays.
 
         Parameters
         ----------
         numbers : [w, n], window number of each pair.
         """
+        if not what.fitted.any() and not what.asked.any():
+            return what, None, Courses.none(), HeldPairs.none()
+        fit = self._decided(band, windows, numbers, what, what.fitted)
         window, pixel = np.nonzero(what.fitted)
-        if window.size == 0:
-            return what, None, Courses.none()
-        index, tuning, before = band.index[pixel], self.tuning, self.tracer.rays_done
-        scale = self.tracer.axis_factor(index)
-        little = np.float32(tuning.flat_contrast) * what.wanted[what.fitted] / scale
-        of = index, numbers[what.fitted], windows, tuning.edge_rays, tuning.edge_footprint_px
-        fit = self.tracer.edges(*of, what.controlled[what.fitted], little)
-        self.counts.rays += self.tracer.rays_done - before
-        own = fit.scaled(scale)
         centre_us = 0.5 * (windows.begin_us + windows.end_us)
         given = what.pilot, self._footprint_px(band), what.wanted[what.fitted], centre_us, what.barred
-        edge_courses = courses(window, pixel, own, *given)
-        return what.without(edge_courses.window, edge_courses.pixel), fit, edge_courses
+        edge_courses = courses(window, pixel, fit.scaled(self.tracer.axis_factor(band.index[pixel])), *given)
+        what = what.without(edge_courses.window, edge_courses.pixel)
+        # light that is hidden from all decision rays may come through a gap, if one ray of it would weigh too much
+        asked = what.asked & what.rendered & (what.differences.rays == 0) & (what.floor <= self.tuning.edge_rays)
+        more = asked & ~what.fitted
+        # fits of both kinds in order of the window
+        fits = EdgeFit.empty(int(np.count_nonzero(what.fitted | more)))
+        is_known = what.fitted[what.fitted | more]
+        fits.replace(np.flatnonzero(is_known), fit)
+        fits.replace(np.flatnonzero(~is_known), self._decided(band, windows, numbers, what, more))
+        what = replace(what, fitted=what.fitted | more)
+        window, pixel = np.nonzero(what.fitted)
+        scaled, wanted = fits.scaled(self.tracer.axis_factor(band.index[pixel])), what.wanted[what.fitted]
+        held = held_pairs(window, pixel, scaled, wanted, self.tuning.low_contrast, what.rendered, asked)
+        return what.without(held.window, held.pixel), fits, edge_courses, held
+
+    def _decided(
+        self, band: Band, windows: Windows, numbers: NDArray[np.int64], what: Plan, which: NDArray[np.bool_]
+    ) -> EdgeFit:
+        """Fits to decision rays of some pairs of a plan, [w, n]; fluxes on the optical axis."""
+        before, tuning = self.tracer.rays_done, self.tuning
+        index = band.index[np.nonzero(which)[1]]
+        little = np.float32(tuning.flat_contrast) * what.wanted[which] / self.tracer.axis_factor(index)
+        of = index, numbers[which], windows, tuning.edge_rays, tuning.edge_footprint_px
+        fit = self.tracer.edges(*of, what.controlled[which], little)
+        self.counts.rays += self.tracer.rays_done - before
+        return fit
 
     def render(
         self,

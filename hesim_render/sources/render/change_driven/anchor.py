@@ -21,14 +21,14 @@ from hesim_render.sources.render.change_driven.windows import Windows
 _PERIOD_US, _BLOCKS = 64_000, 4
 
 
-def period_us(end_us: NDArray[np.float64]) -> float:
-    """Time from one anchor to the next, µs, for blocks with windows that end at these times."""
-    return max(_PERIOD_US, _BLOCKS * float(end_us[-1] - end_us[0]))
+def period_us(end_us: NDArray[np.float64], has_ticks: bool) -> float:
+    """Time from one anchor to the next, µs, for blocks with windows that end at these times, which may be ticks."""
+    return max(_PERIOD_US, _BLOCKS * float(end_us[-1] - end_us[0])) if has_ticks else _PERIOD_US
 
 
-def anchor_us(begin_us: NDArray[np.float64], end_us: NDArray[np.float64]) -> tuple[float, float]:
+def anchor_us(begin_us: NDArray[np.float64], end_us: NDArray[np.float64], has_ticks: bool) -> tuple[float, float]:
     """Begin and end of the anchor of a block, µs: a window as long as the first of the block."""
-    end, period = float(end_us[0]), period_us(end_us)
+    end, period = float(end_us[0]), period_us(end_us, has_ticks)
     last = float(np.floor(end / period) * period)
     return last - (end - float(begin_us[0])), last
 

@@ -52,6 +52,8 @@ def about_edges(
     edges : models of all pairs; None where no pair has one.
     """
     is_worth_it = rays >= tuning.edge_least_rays
+    if known is not None:
+        is_worth_it |= known[0]
     place = np.flatnonzero(is_worth_it if tried is None else is_worth_it & tried)
     if place.size == 0:
         return rays, None

@@ -45,7 +45,7 @@ class Blocks:
     def __init__(self, renderer: AdaptiveRenderer, pixel: NDArray[np.uint32], first: Block) -> None:
         self._renderer = renderer
         self.base = Flux.zeros(1, pixel.size)
-        span_us = anchor_us(first.begin_us, first.end_us)
+        span_us = anchor_us(first.begin_us, first.end_us, renderer.has_ticks)
         # the anchor of the first window at all pixels: constant pixels keep this flux for the whole run
         begin, end = (np.full(pixel.size, time) for time in span_us)
         near_us = Windows(first.begin_us, first.end_us).span_us
@@ -81,7 +81,7 @@ class Blocks:
         parts: list[tuple[NDArray[np.int64], Knots]] = []
         # interpolation runs between the middles of windows
         centre = 0.5 * (block.begin_us + block.end_us)
-        span_us = anchor_us(block.begin_us, block.end_us)
+        span_us = anchor_us(block.begin_us, block.end_us, renderer.has_ticks)
         for number, band in enumerate(self._bands):
             # a new anchor every 64 ms; the old one is no longer compared with
             if self._anchors[number].span_us != span_us:
@@ -102,15 +102,18 @@ class Blocks:
                 # by itself, so that the other windows are traced by the calls of a run that comes from the block before
                 first = renderer.render(band, windows, numbers[:1], what.first())[0]
                 anchor.render(windows, what.first(), None, first)
-            # windows between two fits of one edge drop out of the plan
-            what, fit, followed = renderer.follow(band, windows, numbers, what)
+            # windows between two fits of one edge, and those that show what an earlier one does, drop out of the plan
+            what, fit, followed, held = renderer.follow(band, windows, numbers, what)
             flux, _ = renderer.render(band, windows, numbers, what, first=first, fit=fit)
             # differences are put beside the pairs that were rendered by themselves
             anchor.render(windows, what, first, flux)
+            # a fit of an edge may be held
+            held.fill(flux)
             followed.fill(flux, centre)
-            # knots are windows that were rendered, and those that an edge was followed through
+            # knots are windows that were rendered, those that an edge was followed through, and those that were held
             known = what.rendered.copy()
             known[followed.window, followed.pixel] = True
+            known[held.window, held.pixel] = True
             parts.append((band.place, Knots.of(flux, known, centre)))
         out = BlockFlux(self._last.half_a.shape[1], parts)
         # where a block goes on after the run, its last window may be unknown

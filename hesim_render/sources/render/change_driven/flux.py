@@ -219,7 +219,7 @@ class ChangeDrivenFlux:
             # of the sites, some are neighbours beyond the patch
             share, before = band.place.size / band.sites.size, renderer.counts.pilot_rays
             is_compared = role == "events" and not is_anchor
-            anchor = Anchor(renderer, band, anchor_us(begin_us, end_us)) if is_compared else None
+            anchor = Anchor(renderer, band, anchor_us(begin_us, end_us, renderer.has_ticks)) if is_compared else None
             rays[1] += share * (renderer.counts.pilot_rays - before)
             before = renderer.counts.pilot_rays
             against = () if anchor is None else (anchor.pilot, renderer.look_stride)
@@ -231,7 +231,7 @@ class ChangeDrivenFlux:
             )
             before, fit = self._tracer.rays_done, None
             if windows.size > 1:
-                what, fit, _ = renderer.follow(band, windows, numbers[:, : band.place.size], what)
+                what, fit, *_ = renderer.follow(band, windows, numbers[:, : band.place.size], what)
             rays[0] += self._tracer.rays_done - before
             # the first window of a block belongs to the block before
             todo = what.rendered.copy()
@@ -263,6 +263,11 @@ class ChangeDrivenFlux:
             near_by[band.place] = band.sites.most(near, REACH)
         renderer.counts, self._tracer.rays_done = counts, done
         return near_by
+
+    @property
+    def has_ticks(self) -> bool:
+        """True if event pixels compare at a fixed tick."""
+        return self._renderer.has_ticks
 
     def is_apart(self, role: Role) -> bool:
         """True if pixels of a role have no direct neighbours of that role."""

@@ -51,7 +51,7 @@ def forecast(source: ChangeDrivenFlux, demand: Demand) -> Estimate:
         # the last block goes beyond the end of the run, which counts where all blocks are looked at
         is_all = len(chosen) == len(every)
         ends = [int(np.flatnonzero(b.wanted)[-1]) if is_all and b.wanted.any() else None for b in chosen]
-        begin_us, end_us = anchor_us(every[0].begin_us, every[0].end_us)
+        begin_us, end_us = anchor_us(every[0].begin_us, every[0].end_us, source.has_ticks)
         anchor = np.array([begin_us]), np.array([end_us])
         # what never changes is rendered in the first anchor alone
         alive = source.may_change(patch, *anchor)
@@ -70,7 +70,7 @@ def forecast(source: ChangeDrivenFlux, demand: Demand) -> Estimate:
             begin = source.foretell(moving, every[0].begin_us[:1], every[0].end_us[:1], "events")[0]
         # where nearly all may change, the pilot of the first anchor goes on
         begin -= pilot if 1 - alive_part <= FEW else 0.0
-        share = np.mean([np.ptp(block.end_us) / period_us(block.end_us) for block in chosen])
+        share = np.mean([np.ptp(block.end_us) / period_us(block.end_us, source.has_ticks) for block in chosen])
         more_anchors = max(0.0, float(np.ceil(demand.blocks.count * share)) - 1)
         rest = anchors * more_anchors + compared * (1 + more_anchors) + (each + pilots) * demand.blocks.count
         rays += float(first + alive_part * (begin + rest)) * event_pixel.size

@@ -20,6 +20,7 @@ from hesim_render.sources.render.change_driven.change_detector import (
     Wanted,
     windows_with_changes,
 )
+from hesim_render.sources.render.change_driven.deep_shadow import DeepShadow
 from hesim_render.sources.render.change_driven.looks import CHANGES, STATISTICS, Looks
 from hesim_render.sources.render.change_driven.neighbours import Sites
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux, PilotRays, joined
@@ -100,6 +101,7 @@ class Pilot:
     aims : small objects at which rays are aimed; None if there are none.
     change : differences to other windows; None where nothing is compared.
     all_move : True if the camera moves, and with it every edge in the image.
+    deep : sites in deep shadow; None if there are none.
     """
 
     controlled: NDArray[np.float32]
@@ -111,6 +113,7 @@ class Pilot:
     aims: Aims | None = None
     change: Change | None = None
     all_move: bool = False
+    deep: DeepShadow | None = None
 
     @property
     def windows(self) -> int:

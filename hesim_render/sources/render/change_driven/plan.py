@@ -72,6 +72,7 @@ class Plan:
     differences : pairs that are rendered as differences to another window.
     fitted : rendered pairs in which lines are fitted, to follow edges from one to the next; see `edge_courses`.
     barred : pairs between which no edge is followed.
+    asked : rendered pairs that show no change by themselves: their neighbours ask for them.
     pilot : flux of the pilot, e⁻/s.
     aims : small objects at which rays are aimed, by window and site; None if there are none.
     """
@@ -85,6 +86,7 @@ class Plan:
     differences: Differences
     fitted: NDArray[np.bool_]
     barred: NDArray[np.bool_]
+    asked: NDArray[np.bool_]
     pilot: NDArray[np.float32]
     aims: Aims | None = None
 
@@ -114,7 +116,7 @@ class Plan:
 
     def first(self) -> Plan:
         """The plan of the first window alone."""
-        names = "rendered", "rays", "controlled", "error", "wanted", "floor", "fitted", "barred", "pilot"
+        names = "rendered", "rays", "controlled", "error", "wanted", "floor", "fitted", "barred", "asked", "pilot"
         first = {name: getattr(self, name)[:1] for name in names}
         return replace(self, differences=self.differences.first(), **first)
 
@@ -159,6 +161,7 @@ def plan(
         Differences.none(*shape),
         np.zeros(shape, np.bool_),
         np.zeros(shape, np.bool_),
+        np.zeros(shape, np.bool_),
         pilot.steady_flux[:, sites.listed],
         pilot.aims,
     )
@@ -166,13 +169,18 @@ def plan(
         # what must change, at least, for a window to be rendered, [window, site]
         flux, least = pilot.steady_flux, np.float32(tuning.change * tuning.tolerance * quality) * units
         marked = changes(flux, least)
+        if pilot.deep is not None:
+            # many rays in a few windows say when deep shadow ends
+            marked[:, pilot.deep.place] |= changes(pilot.deep.flux, least[:, pilot.deep.place])
         # a large change of a neighbour may reach a pixel, and an extreme one more pixels and windows away
         large = changes(flux, np.float32(tuning.large_change) * least)
         extreme = longer(changes(flux, np.float32(tuning.extreme_change) * least), tuning.extreme_windows)
         # the first and the last window are rendered anyway, as the ends of all interpolation
         for window in range(1, last):
             near = sites.most(large[window], 1) | sites.most(extreme[window], 2)
-            out.rendered[window] = marked[window][sites.listed] | near
+            own = marked[window][sites.listed]
+            out.rendered[window] = own | near
+            out.asked[window] = near & ~own
         if pilot.refined:
             # an object that passes within a window or two does not change the flux linearly
             looked_at = np.zeros(flux.shape, np.bool_)
@@ -180,6 +188,7 @@ def plan(
                 looked_at[window, refined.place] = True
             out.barred[:] = longer(looked_at, 1)[:, sites.listed]
             out.rendered[1:last] |= out.barred[1:last]
+            out.asked[:] &= ~out.barred
     # rays, estimator and expected error of every pair; many windows are interpolated from the ends of a block
     for window in range(count):
         at_end = is_knot and window in (0, last)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.method_cache import method_cache
 from hesim_render.core.units import S_PER_US
-from hesim_render.mosaic.schedule import BLOCK_INTERVALS, CELL_US
+from hesim_render.mosaic.schedule import CELL_US
 from hesim_render.sources.render.camera import View
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.motion_bounds import fastest_m_per_s, fastest_turn_rad_per_s, places
@@ -23,7 +23,7 @@ STEP_PX = 0.05
 LEAST_US = 10
 #: Cells for which distances are taken together, and the part of a distance that is relied on: between the rays that
 #: measure how far the scene is, something may be nearer.
-_CELLS, _SURE = BLOCK_INTERVALS, 0.5
+_CELLS, _SURE = 16, 0.5
 #: Least depth of an object that is assumed, as a part of its distance from the camera.
 _NEAREST = 0.05
 

@@ -42,6 +42,13 @@ class Tuning:
         differ, it looks again half way between, and so on. Within this time, nothing moves by more than 0.8 pixels, so
         that nothing crosses the pixels around between two looks. Without (1): most of a pilot's rays see what the last
         ones saw.
+    deep_looks : windows, C. Windows of a block, its ends included, in which the pilot looks at deep shadow where pixels
+        lie apart. Without (2): the light of such a pixel is a straight line from one end of a block to the other.
+    deep_rays : rays, C. Rays of such a look. As few as `pilot_rays`: they meet no light either.
+    deep_weight : wanted errors, H. Unshadowed light of a pixel in deep shadow, at least. Without (0): pixels are looked
+        at in which the light that the pilot misses is less than their noise.
+    deep_part : part, H. Of the unshadowed light, the pilot sees less than this there. Without (1): every pixel of a
+        bright scene is looked at.
     zoom_rays : rays, H. Largest number of pilot rays for a pixel that is crossed by an object which few rays could
         miss; a pair gets as many if the object is small. Without: objects smaller than a pixel come and go unseen, or
         one ray hits them and weighs far too much.
@@ -135,6 +142,10 @@ class Tuning:
     lone_pilot_rays: int = 32
     frame_pilot_rays: int = 64
     look_stride: int = 16
+    deep_looks: int = 9
+    deep_rays: int = 256
+    deep_weight: float = 1024.0
+    deep_part: float = 1 / 32
     zoom_rays: int = 256
     zoom_room: float = 64.0
     gloss_room: float = 16.0
