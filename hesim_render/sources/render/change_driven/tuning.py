@@ -44,7 +44,7 @@ class Tuning:
         ones saw.
     deep_looks : windows, C. Windows of a block, its ends included, in which the pilot looks at deep shadow where pixels
         lie apart. Without (2): the light of such a pixel is a straight line from one end of a block to the other.
-    deep_rays : rays, C. Rays of such a look. As few as `pilot_rays`: they meet no light either.
+    deep_rays : rays, C. Rays of such a look. Without (as few as `pilot_rays`): they meet no light either.
     deep_weight : wanted errors, H. Unshadowed light of a pixel in deep shadow, at least. Without (0): pixels are looked
         at in which the light that the pilot misses is less than their noise.
     deep_part : part, H. Of the unshadowed light, the pilot sees less than this there. Without (1): every pixel of a
