@@ -142,7 +142,7 @@ class Tuning:
     lone_pilot_rays: int = 32
     frame_pilot_rays: int = 64
     look_stride: int = 16
-    deep_looks: int = 9
+    deep_looks: int = 5
     deep_rays: int = 256
     deep_weight: float = 1024.0
     deep_part: float = 1 / 32
