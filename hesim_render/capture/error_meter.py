@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.sources.render.audit.audit import MOST_OFF, TOLERANCE
 
@@ -53,8 +54,6 @@ class ErrorMeter:
         half_a, half_b : Dr.Jit Float [n], electrons; the same array if a source has no error of this kind.
         noise : maps electrons [k] and places in the picture [k] to one standard deviation of the noise, electrons.
         """
-        import drjit as dr
-
         types, count = jit(), dr.width(half_a)
         if half_a is half_b or count == 0:
             return

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 
 #: Length of the JSON text that comes first; the data of the arrays follow it in order.
 _LENGTH = struct.Struct("<Q")
@@ -108,8 +109,6 @@ def _outline(value: Any, arrays: list[NDArray]) -> Any:
 
 def _filled(outline: Any, data: bytes, begin: int) -> tuple[Any, int]:
     """The value of an outline, and the end of its data."""
-    import drjit as dr
-
     if not isinstance(outline, dict):
         return outline, begin
     ((kind, given),) = outline.items()

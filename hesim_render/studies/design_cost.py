@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float64
 from hesim_render.core.tables import table
 from hesim_render.sensor.photocurrent import photocurrent
@@ -134,8 +135,6 @@ class DesignCost:
         responses : response of each filter at the bands, Dr.Jit Float64 [band].
         counts : pixels of each channel of the frames in an output pixel, Dr.Jit numbers; None: those of `noise`.
         """
-        import drjit as dr
-
         if counts is None:
             counts = [dr.opaque(jit().Float64, float(count)) for count in self.noise.count]
         name = self.sensor.layout.filters[0]
@@ -154,8 +153,6 @@ class DesignCost:
         return total
 
     def _of_condition(self, condition: Condition, per_lux: list[Float64], counts: Sequence[Float64]) -> Float64:
-        import drjit as dr
-
         count = len(condition.xyz)
         index = dr.arange(jit().UInt32, count)
         chosen = [dr.gather(jit().Float64, per_lux[k], index) for k in self.frames]
@@ -175,8 +172,6 @@ class DesignCost:
 
     def _contrast(self, per_lux: list[Float64], grey: int, lux: float) -> Float64:
         """Relative rise of the light on the grey card that gives an event, the mean over event filters."""
-        import drjit as dr
-
         total: Float64 = jit().Float64(0.0)
         rise, baseline_e = self.event_scale
         for k in self.events:
@@ -188,8 +183,6 @@ class DesignCost:
 
     def _difference(self, condition: Condition, electrons: list[Float64], counts: Sequence[Float64] | None) -> Float64:
         """√J with its best matrix; without noise where there are no counts."""
-        import drjit as dr
-
         types, noise = jit(), self.noise
         if counts is not None:
             noise = replace(noise, count=np.array([float(each[0]) for each in counts]))

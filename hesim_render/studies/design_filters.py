@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float64
 from hesim_render.core.tables import table
 
@@ -62,8 +63,6 @@ class Dyes:
 
     def transmittance(self, parameters: list[Float64]) -> Float64:
         """See `Family.transmittance`."""
-        import drjit as dr
-
         grid = table(jit().Float64, self.wavelength_nm)
         absorbance = dr.zeros(jit().Float64, self.wavelength_nm.size)
         for k in range(self.bands):
@@ -112,8 +111,6 @@ class ThinFilms:
 
     def transmittance(self, parameters: list[Float64]) -> Float64:
         """See `Family.transmittance`."""
-        import drjit as dr
-
         grid = table(jit().Float64, self.wavelength_nm)
         # B = b_re + i b_im, C = c_re + i c_im, from the substrate to the light
         b_re, b_im, c_re, c_im = (
@@ -170,8 +167,6 @@ class FreeCurves:
 
     def transmittance(self, parameters: list[Float64]) -> Float64:
         """See `Family.transmittance`."""
-        import drjit as dr
-
         knots = self.knots_nm
         place = np.clip(np.searchsorted(knots, self.wavelength_nm, side="right") - 1, 0, knots.size - 2)
         share = (self.wavelength_nm - knots[place]) / (knots[place + 1] - knots[place])

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.rng import Stream, device_uniform
 from hesim_render.core.units import US_PER_S
@@ -68,8 +69,6 @@ class TelegraphPixels:
         -------
         Float, DN, one value per entry of `index`.
         """
-        import drjit as dr
-
         types = jit()
         every = dr.zeros(types.Float, pixels)
         values = types.Float(self.values_dn(seed, frame).astype(np.float32))

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import (
     Float,
     Interaction,
@@ -201,8 +202,6 @@ class MovingScene:
         active : lanes to trace.
         flags : `RayFlags`, fields to compute; default all.
         """
-        import drjit as dr
-
         mi = self.mi
         flags = mi.RayFlags.All if flags is None else flags
         hit, face = self._resting.nearest(ray, coherent, active)
@@ -242,7 +241,6 @@ class MovingScene:
         """Distance to the nearest surface of all parts, m, infinite where there is none; and True where a box was
         met.
         """
-        import drjit as dr
 
         def visit(group: Group, own: DevicePose, local: Ray, near: Mask, state: LoopState) -> LoopState:
             local.maxt = dr.minimum(local.maxt, state[0])
@@ -303,8 +301,6 @@ class MovingScene:
         -------
         state, met : the final state; and Dr.Jit Bool, True where any box was met.
         """
-        import drjit as dr
-
         met = self.mi.Bool(False)
         inverse = inverse_of(ray.d)
         for number in self._single:
