@@ -78,10 +78,6 @@ def _by_content(node: Any, files: dict[str, str]) -> Any:
 class Generator:
     """All generated scenes of a benchmark. Each is a pure function of the specification and its numbers.
 
-    Parameters
-    ----------
-    spec : the benchmark.
-
     Raises
     ------
     SpecError

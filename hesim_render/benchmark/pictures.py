@@ -182,7 +182,7 @@ class ClipDevelopment:
 
 
 def bilinear(raw: NDArray, tile: ArrayLike) -> NDArray[np.float64]:
-    """Every channel at every pixel.
+    """Every channel at every pixel, [row, col, channel], DN.
 
     The tent falls to zero one tile away, so that every pixel has samples of every channel. On a Bayer tile this is the
     usual bilinear interpolation. Measured values stay as they are.
@@ -191,10 +191,6 @@ def bilinear(raw: NDArray, tile: ArrayLike) -> NDArray[np.float64]:
     ----------
     raw : [row, col], DN.
     tile : [tile_row, tile_col], channel number of each position from 0 on, -1 where there is no value.
-
-    Returns
-    -------
-    float64 [row, col, channel], DN.
     """
     block = np.asarray(tile)
     rows, cols = np.ogrid[: raw.shape[0], : raw.shape[1]]

@@ -45,12 +45,7 @@ class Store(Protocol):
 
 
 class FolderStore:
-    """A folder of this machine, which appears whole or not at all.
-
-    Parameters
-    ----------
-    root : the folder.
-    """
+    """A folder of this machine, which appears whole or not at all."""
 
     def __init__(self, root: Path) -> None:
         self._root = root.expanduser().resolve()

@@ -11,15 +11,11 @@ _Number = TypeVar("_Number", np.int64, np.float64)
 
 
 def distinct_pixels(*lists: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Mosaic indices that occur in any of some lists.
+    """Mosaic indices that occur in any of some lists, ascending.
 
     Parameters
     ----------
     lists : mosaic indices, [n] each.
-
-    Returns
-    -------
-    The indices in ascending order, each once.
     """
     size = max((int(pixel.max()) + 1 for pixel in lists if pixel.size), default=0)
     occurs = np.zeros(size, np.bool_)

@@ -232,15 +232,12 @@ def write_tick_files(recording: Recorded, folder: Path, tick_us: int | None) -> 
 
     H-ESIM has frames as ``raw`` and events as ``events``, -1, 0 or +1; RGB-Event-ISP has ``aps_raw`` and ``event_raw``,
     0, 1 (OFF) or 2 (ON). Each file has both. Of two events of a pixel in one tick the later one counts.
+    Returns the number of frames.
 
     Parameters
     ----------
     recording, folder : the recording, and a folder, which is made.
     tick_us : interval of the comparisons, µs; None writes frames alone.
-
-    Returns
-    -------
-    The number of frames.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for frame in recording.frames:

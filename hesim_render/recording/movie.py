@@ -32,6 +32,7 @@ def write_movie(recording: Recorded, path: Path, kind: str) -> int:
     """Write an MP4 file (H.264) with a picture for each frame, or for each 10 ms where there are no frames.
 
     Without frames there are at most 6000 pictures: those of a recording of more than a minute show longer times.
+    Returns the number of pictures.
 
     A recording that gives fewer than 50 of them has several pictures for each, in equal steps of time, so that what
     is short plays for two seconds. The events of a picture are those since the one before, over the frame that ends
@@ -41,10 +42,6 @@ def write_movie(recording: Recorded, path: Path, kind: str) -> int:
     ----------
     recording, path, kind : recording, file, and ``mp4`` (events over the colour view), ``mp4-colour`` or
         ``mp4-events``.
-
-    Returns
-    -------
-    The number of pictures.
 
     Raises
     ------

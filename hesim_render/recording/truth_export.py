@@ -37,7 +37,7 @@ _DSEC_ZERO, _DSEC_STEPS, DSEC_EVERY_US = 1 << 15, 128.0, 100_000
 def export_truth(
     recording: Recorded, format_: str, out: str | Path, *, every_us: int | None = None, overwrite: bool = False
 ) -> Path:
-    """Write the geometric truth of a recording in a format that others read.
+    """Write the geometric truth of a recording in a format that others read; returns the folder.
 
     Parameters
     ----------
@@ -48,10 +48,6 @@ def export_truth(
     out : folder to write.
     every_us : interval of flow (default 100 000), of poses (default 1000) or of boxes (default 50 000), µs.
     overwrite : replace an existing export.
-
-    Returns
-    -------
-    The folder.
 
     Raises
     ------

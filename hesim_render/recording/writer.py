@@ -166,12 +166,7 @@ class RecordingWriter:
             self._folder.set_event_objects(truth.objects_at)
 
     def set_events_dropped(self, count: int) -> None:
-        """Set how many events were lost in the read-out. No other count includes them.
-
-        Parameters
-        ----------
-        count : number of lost events.
-        """
+        """Set how many events were lost in the read-out. No other count includes them."""
         if self._folder is not None:
             self._folder.set_events_dropped(count)
         self._dropped = int(count)

@@ -60,10 +60,6 @@ class DesignResult:
 class Problem:
     """Parameters, constraints and cost of a design.
 
-    Parameters
-    ----------
-    spec : the design.
-
     Raises
     ------
     SpecError
@@ -244,10 +240,6 @@ def optimise(problem: Problem, progress: Callable[[float, float, str], None] | N
     ----------
     problem : the design.
     progress : called with (done, total, what).
-
-    Returns
-    -------
-    The best filters.
     """
     from scipy.optimize import minimize
 

@@ -223,17 +223,13 @@ def best_matrix(
     xyz: NDArray[np.float64],
     weights: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """M with the least Σ |W (M c − x)|² + Σ_c Var(c_c) |W M_c|², by its normal equations.
+    """M with the least Σ |W (M c − x)|² + Σ_c Var(c_c) |W M_c|², by its normal equations, [3, channel].
 
     Parameters
     ----------
     electrons, variance : [surface, channel].
     xyz : [surface, 3].
     weights : [surface, 3, 3].
-
-    Returns
-    -------
-    [3, channel].
     """
     count = electrons.shape[1]
     # channels of one size, so that the equations are well conditioned

@@ -43,14 +43,7 @@ class Family(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Dyes:
-    """10^(−A) with A a sum of Gaussian bands, between a least and a largest transmittance.
-
-    Parameters
-    ----------
-    wavelength_nm : of the result.
-    bands : number of bands.
-    most, least : largest and least transmittance.
-    """
+    """10^(−A) with A a sum of Gaussian bands, between a least and a largest transmittance."""
 
     wavelength_nm: NDArray[np.float64]
     bands: int

@@ -27,10 +27,6 @@ def pareto_front(cost: NDArray[np.float64], gain: NDArray[np.float64]) -> NDArra
     Parameters
     ----------
     cost, gain : [n].
-
-    Returns
-    -------
-    bool [n].
     """
     better = (cost[None] <= cost[:, None]) & (gain[None] >= gain[:, None])
     strictly = (cost[None] < cost[:, None]) | (gain[None] > gain[:, None])

@@ -78,10 +78,6 @@ class Table:
         Parameters
         ----------
         number : from 0 on; negative ones count from the end.
-
-        Returns
-        -------
-        Cells by column.
         """
         return {name: self._rows[number].get(name) for name in self._columns}
 
@@ -122,19 +118,11 @@ class Table:
         Parameters
         ----------
         more : further entries of the top level.
-
-        Returns
-        -------
-        The text.
         """
         return json.dumps({**more, "columns": self._columns, "rows": [_plain(row) for row in self]}, indent=1) + "\n"
 
     def to_pandas(self) -> Any:
         """The table as a pandas data frame.
-
-        Returns
-        -------
-        ``pandas.DataFrame``.
 
         Raises
         ------
@@ -154,10 +142,6 @@ class Table:
         ----------
         path : ends in ``.csv``, ``.json`` or ``.parquet``.
         overwrite : replace a file that is there.
-
-        Returns
-        -------
-        The file.
 
         Raises
         ------

@@ -48,10 +48,6 @@ def _search(mean: Float, high: UInt32, low: UInt32) -> Float:
     ----------
     mean : expected count.
     high, low : words of u, a 64-bit fraction.
-
-    Returns
-    -------
-    Float, whole numbers.
     """
     types = jit()
     wide = types.Float64(mean)

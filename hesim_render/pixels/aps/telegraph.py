@@ -57,17 +57,13 @@ class TelegraphPixels:
         return np.where(high, *formulas.telegraph_levels(self.amplitude_dn, self.high_share)[::-1])
 
     def added_dn(self, seed: int, frame: int, pixels: int, index: UInt32) -> Float:
-        """Deviations from the mean in a frame on the device; 0 at pixels without telegraph noise.
+        """Deviations from the mean in a frame on the device; 0 at pixels without telegraph noise, DN.
 
         Parameters
         ----------
         seed, frame : seed of the noise and number of the frame.
         pixels : number of pixels of the region.
         index : pixels that are asked for.
-
-        Returns
-        -------
-        Float, DN, one value per entry of `index`.
         """
         types = jit()
         every = dr.zeros(types.Float, pixels)

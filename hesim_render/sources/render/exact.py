@@ -218,10 +218,6 @@ class RenderedFlux(WindowByWindow):
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """Mean Φ of each listed pixel over its own interval; see `FluxSource.mean_flux`.
 
-        Returns
-        -------
-        half_a, half_b : Dr.Jit Float [n], e⁻/s.
-
         Raises
         ------
         RangeError

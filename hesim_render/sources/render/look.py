@@ -59,10 +59,6 @@ def look(scene: Scene, sensor: Sensor) -> FramingLook:
     ----------
     scene, sensor : from `load_scene` and `load_sensor`, cropped to the region that is read out.
 
-    Returns
-    -------
-    The picture and the place of the target.
-
     Raises
     ------
     SpecError

@@ -114,12 +114,7 @@ class Projection:
 
 
 class DeviceProjection:
-    """`Projection.unproject` on the device, in float32.
-
-    Parameters
-    ----------
-    projection : the projection.
-    """
+    """`Projection.unproject` on the device, in float32."""
 
     def __init__(self, projection: Projection) -> None:
         types = jit()

@@ -125,10 +125,6 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
     spec : content of the scene file.
     responses : spectra that light and reflectance must cover (≥ 99.9 % of each), by name.
 
-    Returns
-    -------
-    The loaded scene.
-
     Raises
     ------
     SpecError

@@ -85,11 +85,6 @@ def emitters(mi: MitsubaModule, given: Sequence[LightSpec]) -> dict[str, Any]:
     a one-sided Lambertian rectangle, L = E / ∫ cos θ dω exactly, black if it is switched off. ``environment``: see
     there.
 
-    Parameters
-    ----------
-    mi : the mitsuba module.
-    given : lights of the scene file.
-
     Raises
     ------
     SpecError

@@ -50,12 +50,6 @@ def area_emitter(radiance: Spectrum | None) -> dict[str, Any] | None:
 def bsdf_of(mi: MitsubaModule, item: ObjectSpec, spec: SceneSpec) -> Any:
     """BSDF of an object, or its dictionary for Mitsuba. Open shapes that reflect only do so on both sides.
 
-    Parameters
-    ----------
-    mi : the mitsuba module.
-    item : the object.
-    spec : its scene.
-
     Raises
     ------
     SpecError

@@ -44,10 +44,6 @@ class RectangleLight:
         ----------
         point : Point3f per lane.
         normal : unit Vector3f per lane.
-
-        Returns
-        -------
-        Float per lane, sr.
         """
         mi = self._mi
         rays = [corner - point for corner in self._corners]
@@ -66,10 +62,6 @@ class RectangleLight:
         ----------
         point, normal : see `irradiance`.
         place : Point2f in [0, 1)², random numbers.
-
-        Returns
-        -------
-        The point, Point3f, and its contribution, Float, sr.
         """
         drawn = dr.fma(self._half_width, 2 * place.x - 1, dr.fma(self._half_height, 2 * place.y - 1, self._middle))
         to = drawn - point

@@ -223,10 +223,6 @@ def largest(parts: Sequence[Sequence[Outline]]) -> list[list[Outline]]:
 class OccludedSky:
     """What the outlines of a moving scene hide of a uniform sky.
 
-    Parameters
-    ----------
-    scene : the scene.
-
     Attributes
     ----------
     is_known : True if there are any outlines.
