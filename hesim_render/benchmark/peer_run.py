@@ -44,12 +44,7 @@ class PeerRun:
 
 
 def program_of(peer: Peer, folder: Path) -> str | None:
-    """Path of the program of a peer; None if it is not installed here.
-
-    Parameters
-    ----------
-    peer, folder : the peer, and the folder of the file that names it.
-    """
+    """Path of the program of a peer whose file is in `folder`; None if it is not installed here."""
     first = peer.command[0]
     if len(Path(first).parts) > 1:
         path = (folder / Path(first).expanduser()).absolute()  # a link into a virtual environment is not followed

@@ -158,12 +158,7 @@ class ClipDevelopment:
         return channels.astype(np.float64) / (np.array(gains) / min(gains)) * span + black
 
     def channel_scores(self, channels: NDArray, truth: NDArray) -> dict[str, float]:
-        """Measures of a demosaiced frame against the truth, as those of `scores`.
-
-        Parameters
-        ----------
-        channels, truth : [row, col, channel], DN.
-        """
+        """Measures of a demosaiced frame [row, col, channel], DN, against the truth, as those of `scores`."""
         mosaic = self._clip.recording.mosaic
         black, span = mosaic.black_level_dn, mosaic.white_level_dn - mosaic.black_level_dn
         result = {"channel_psnr_db": psnr((channels - black) / span, (truth - black) / span)}

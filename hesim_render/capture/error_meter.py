@@ -73,12 +73,7 @@ class ErrorMeter:
         self.values += error.size
 
     def as_dict(self, wanted: float | None = None) -> dict[str, float] | None:
-        """Statistics for the manifest, in units of noise; None without values.
-
-        Parameters
-        ----------
-        wanted : error that was asked for, in units of noise.
-        """
+        """Statistics for the manifest, in units of noise, with the error that was `wanted`; None without values."""
         if not self.values:
             return None
         result = {"rms": float(np.sqrt(self._square / self.values))}

@@ -76,12 +76,7 @@ def to_bytes(value: Any) -> bytes:
 
 
 def from_bytes(data: bytes) -> Any:
-    """The value that `to_bytes` was given; its arrays may be written to.
-
-    Parameters
-    ----------
-    data : from `to_bytes`.
-    """
+    """The value that `to_bytes` was given; its arrays may be written to."""
     (length,) = _LENGTH.unpack_from(data)
     begin = _LENGTH.size + length
     value, _ = _filled(json.loads(data[_LENGTH.size : begin]), data, begin)

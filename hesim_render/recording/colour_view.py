@@ -24,10 +24,6 @@ def colour_picture(raw: NDArray[np.uint16], mosaic: Mosaic, max_width: int = 102
     raw : [row, col], DN.
     mosaic : description of the tile and its colours.
     max_width : wider frames are binned until they fit, px.
-
-    Returns
-    -------
-    uint8 [row, col, 3], sRGB.
     """
     tile_cols = mosaic.tile_shape[1]
     if raw.shape[1] <= max_width:

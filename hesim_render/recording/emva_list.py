@@ -205,12 +205,7 @@ def numbers(
 
 
 class _Pictures:
-    """Pictures of a list by the names that it gives them.
-
-    Parameters
-    ----------
-    file : the list; its folder holds them.
-    """
+    """Pictures in the folder of a list, by the names that the list gives them."""
 
     def __init__(self, file: Path) -> None:
         self._file, self._folder = file, file.parent

@@ -161,10 +161,6 @@ def import_events(
     shape : rows and columns of the event grid, px; needed if the file does not state them.
     overwrite : replace an existing file.
 
-    Returns
-    -------
-    The file written, absolute.
-
     Raises
     ------
     OutputError

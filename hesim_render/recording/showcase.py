@@ -173,12 +173,7 @@ def _ms(microseconds: int) -> str:
 
 
 def write_preview_dng(path: Path, frame: Frame, mosaic: Mosaic) -> None:
-    """Write the file of a frame whose own DNG developers do not open (`needs_preview`).
-
-    Parameters
-    ----------
-    path, frame, mosaic : file, frame, and its tile.
-    """
+    """Write the file of a frame whose own DNG developers do not open (`needs_preview`)."""
     smaller = binned(frame.raw, mosaic)
     if smaller is not None and smaller[1].tile_code.max() < _THREE:
         raw, own = smaller

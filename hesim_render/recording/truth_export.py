@@ -174,10 +174,6 @@ def tum_lines(t_us: NDArray[np.float64], poses: NDArray[np.float64]) -> list[str
     ----------
     t_us : [n], µs.
     poses : [n, 4, 4], to world.
-
-    Returns
-    -------
-    One line for each pose, without line ends.
     """
     quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     rows = np.concatenate([poses[:, :3, 3], quaternion], axis=1)

@@ -73,24 +73,15 @@ class Table:
         return np.array(cells, dtype=object)
 
     def row(self, number: int) -> dict[str, Cell]:
-        """One row with all columns.
-
-        Parameters
-        ----------
-        number : from 0 on; negative ones count from the end.
-        """
+        """One row with all columns; negative numbers count from the end."""
         return {name: self._rows[number].get(name) for name in self._columns}
 
     def where(self, **cells: Cell) -> Table:
-        """The rows whose cells have given values.
+        """The rows whose cells have given values, as a new table.
 
         Parameters
         ----------
         cells : wanted value of each named column.
-
-        Returns
-        -------
-        A new table, perhaps without rows.
 
         Raises
         ------
@@ -113,12 +104,7 @@ class Table:
         return text.getvalue()
 
     def to_json(self, **more: Any) -> str:
-        """The table as JSON text: a list of rows under ``rows``; infinities become texts.
-
-        Parameters
-        ----------
-        more : further entries of the top level.
-        """
+        """The table as JSON text: a list of rows under ``rows``, beside `more` entries; infinities become texts."""
         return json.dumps({**more, "columns": self._columns, "rows": [_plain(row) for row in self]}, indent=1) + "\n"
 
     def to_pandas(self) -> Any:

@@ -73,7 +73,7 @@ class DeviceMaps:
 def draw_dn(
     noise: ApsNoise, maps: DeviceMaps, electrons: Float, exposure_us: float, seed: int, frame: int, first_pixel: int
 ) -> UInt32:
-    """Values of the pixels of a frame from `first_pixel` on; see `ApsNoise.sample_dn`.
+    """Values of the pixels of a frame from `first_pixel` on, UInt32 [n], DN; see `ApsNoise.sample_dn`.
 
     Parameters
     ----------
@@ -83,10 +83,6 @@ def draw_dn(
     exposure_us : exposure, µs.
     seed, frame : seed of the noise and number of the frame.
     first_pixel : index of the first pixel in the region, row-major.
-
-    Returns
-    -------
-    UInt32 [n], DN.
     """
     types, spec = jit(), noise.spec
     index = dr.arange(types.UInt32, dr.width(electrons)) + dr.opaque(types.UInt32, first_pixel)

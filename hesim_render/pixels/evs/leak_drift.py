@@ -32,12 +32,7 @@ _FAR = 4.0
 
 
 class LeakDrift:
-    """Way of each pixel's drift, and what it says about the origin of events.
-
-    Parameters
-    ----------
-    noise : with a leak of the process 'drift'.
-    """
+    """Way of each pixel's drift (a leak of the process 'drift'), and what it says about the origin of events."""
 
     STATE = ("_way", "_per_us", "_at_event")
 

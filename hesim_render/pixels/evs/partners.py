@@ -247,12 +247,7 @@ def _take_over(pixels: EvsStage, reference: Float, which: NDArray[np.int64]) -> 
 
 
 class _WithDeadTime:
-    """Noise-free pixels with the dead time of the real ones.
-
-    Parameters
-    ----------
-    own, nominal, seed : of `Partners`.
-    """
+    """Noise-free pixels with the dead time of the real ones; parameters as for `Partners`."""
 
     def __init__(self, own: EvsNoise, nominal: EvsNoise | None, seed: int) -> None:
         self._cols = own.layout.evs_shape[1]

@@ -62,12 +62,7 @@ class _OverHeight:
 
 
 class GaussianBlur:
-    """A Gaussian, of one width or of a width that follows the image height.
-
-    Parameters
-    ----------
-    sensor : with the lens in use.
-    """
+    """A Gaussian, of one width or of a width that follows the image height; the sensor has the lens in use."""
 
     def __init__(self, sensor: Sensor) -> None:
         types, pitch_um, psf = jit(), sensor.spec.geometry.pitch_um, sensor.optics.psf

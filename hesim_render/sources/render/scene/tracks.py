@@ -67,12 +67,7 @@ class DevicePose:
 
 
 class Tracks:
-    """Tracks of several objects in tables, so that one kernel serves any number of them.
-
-    Parameters
-    ----------
-    trajectories : one or more.
-    """
+    """Tracks of several objects in tables, so that one kernel serves any number of them."""
 
     def __init__(self, trajectories: Sequence[Trajectory]) -> None:
         types = jit()
