@@ -22,7 +22,7 @@ from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectral.physical import silicon_quantum_efficiency
 from hesim_render.studies.colour_noise import channel_noise
 from hesim_render.studies.colour_samples import reflectances_of
-from hesim_render.studies.design_cost import Condition, DesignCost, Weights
+from hesim_render.studies.design_cost import Condition, DesignCost
 from hesim_render.studies.design_filters import Dyes, Family, FreeCurves, ThinFilms
 from hesim_render.studies.design_tile import repeated
 from hesim_render.studies.filter_sets import filters_of, with_filter_set
@@ -135,7 +135,7 @@ class Problem:
             channel_noise(sensor, self.frames, exposure_us, spec.area_px),
             [self.names.index(name) for name in self.frames],
             [self.names.index(name) for name in events], scale, window_us,
-            Weights(spec.cost.colour, spec.cost.noise, spec.cost.events),
+            spec.cost,
         )  # fmt: skip
 
     def transmittances(self, parameters: Float64) -> dict[str, Float64]:

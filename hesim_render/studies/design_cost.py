@@ -25,6 +25,7 @@ from hesim_render.core.device_types import Float64
 from hesim_render.core.tables import table
 from hesim_render.sensor.photocurrent import photocurrent
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.specs.design import CostSpec
 from hesim_render.spectral.colorimetry import lab
 from hesim_render.spectral.spectrum import Spectrum, scale_to_lux
 from hesim_render.studies.colour_noise import GREY, ChannelNoise
@@ -32,15 +33,6 @@ from hesim_render.studies.colour_samples import colour_samples
 
 #: Noise in electrons² of the term of colour alone, which keeps its matrix defined.
 _LEAST_VARIANCE = 1e-3
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights of the parts of the cost: rms colour difference without noise and with it, event contrast."""
-
-    colour: float
-    noise: float
-    events: float
 
 
 def difference_weights(xyz: NDArray[np.float64], white_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -125,7 +117,7 @@ class DesignCost:
     events: Sequence[int]
     event_scale: tuple[float, float]
     event_window_us: float
-    weights: Weights
+    weights: CostSpec
 
     def __call__(self, responses: Sequence[Float64], counts: Sequence[Float64] | None = None) -> Float64:
         """The cost, a Dr.Jit number with derivatives.

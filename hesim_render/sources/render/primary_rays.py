@@ -17,7 +17,7 @@ from hesim_render.core.units import MM_PER_M
 from hesim_render.sources.render.blur import AiryBlur, GaussianBlur, KernelBlur
 from hesim_render.sources.render.camera import View
 from hesim_render.sources.render.projection import DeviceProjection
-from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
+from hesim_render.sources.render.scene.builder import NeedsExactMode
 from hesim_render.specs.lens import MeasuredPsf
 from hesim_render.spectral.spectrum import RENDERABLE_NM
 

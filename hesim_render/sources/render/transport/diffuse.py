@@ -40,7 +40,7 @@ from hesim_render.core.device_types import (
 )
 from hesim_render.core.tables import table
 from hesim_render.sources.render.scene import lights
-from hesim_render.sources.render.scene.paint import Paint
+from hesim_render.sources.render.scene.surfaces import Paint
 from hesim_render.sources.render.transport.irradiance import RectangleLight
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.outlines import OccludedSky

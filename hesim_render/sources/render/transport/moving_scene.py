@@ -31,13 +31,12 @@ from hesim_render.core.device_types import (
     Vector3,
 )
 from hesim_render.core.errors import SpecError
-from hesim_render.sources.render.scene.builder import BuiltScene
+from hesim_render.sources.render.scene.builder import BuiltScene, NeedsExactMode, require_paths
 from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.closed_form import Part, surface_of
 from hesim_render.sources.render.transport.many_objects import Fleet
 from hesim_render.sources.render.transport.motion_bounds import stays_in
-from hesim_render.sources.render.transport.needs_exact import NeedsExactMode, require_paths
 from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows, inverse_of, meets_box
 
 #: Largest number of objects in closed form that are tested one by one; more are tested in a loop of one kernel.
