@@ -30,15 +30,12 @@ class Family(Protocol):
 
     def bounds(self) -> list[tuple[float, float]]:
         """Least and largest value of each parameter of one filter."""
-        ...
 
     def transmittance(self, parameters: list[Float64]) -> Float64:
         """Transmittance at the wavelengths, 0 to 1, from Dr.Jit numbers."""
-        ...
 
     def start(self, wanted: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         """Parameters to start from: near a wanted transmittance, with some chance."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,6 @@ _GOLDEN = 2654435769
 class _Mode(Protocol):
     def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
         """Events; the size of their polarity is their `Origin`, its sign the polarity itself."""
-        ...
 
 
 class Labels(Protocol):
