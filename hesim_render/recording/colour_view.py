@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.mosaic.description import Mosaic
+from hesim_render.recording.recorded import Recorded
 from hesim_render.spectral.colorimetry import encode_srgb
-
-if TYPE_CHECKING:
-    from hesim_render.recording.recorded import Recorded
 
 Picture = NDArray[np.uint8]  # [row, col, 3], sRGB
 

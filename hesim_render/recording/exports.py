@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,7 @@ from hesim_render.exchange.dsec import stream_events
 from hesim_render.exchange.triggers import exposure_triggers
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.recording.movie import write_movie
-
-if TYPE_CHECKING:
-    from hesim_render.recording.recorded import Recorded
+from hesim_render.recording.recorded import Recorded
 
 #: File that says what the frames of a folder are, and marks the folder for `overwrite`.
 FRAMES_NAME = "frames.json"

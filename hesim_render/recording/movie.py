@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,9 +12,7 @@ from hesim_render.core.errors import RangeError
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.recording.colour_view import Picture, black_picture, colour_picture, events_picture
 from hesim_render.recording.preview import magnified
-
-if TYPE_CHECKING:
-    from hesim_render.recording.recorded import Recorded
+from hesim_render.recording.recorded import Recorded
 
 #: Pictures per second of the video, and time that one shows where there are no frames, µs.
 _FPS, _STEP_US = 25, 10_000

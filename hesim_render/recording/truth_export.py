@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,11 @@ from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.box_export import write_coco, write_dsec_det, write_prophesee_boxes
 from hesim_render.recording.camera_files import write_kalibr, write_kalibr_camchain, write_opencv_camera
+from hesim_render.recording.recorded import Recorded
 from hesim_render.recording.truth_file import IMAGES, POSE_STEP_US, images_at
 from hesim_render.sources.render.truth.imu import ImuModel
 from hesim_render.sources.render.truth.raster import Grid
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
-
-if TYPE_CHECKING:
-    from hesim_render.recording.recorded import Recorded
 
 MARKER = "export.json"
 #: DSEC's flow: 16 bit, 1/128 px, zero at 2¹⁵; interval of its flow, µs.
