@@ -39,7 +39,7 @@ class _Comparison:
 def row_offsets(
     signal_dn: NDArray[np.float32], tile: ArrayLike, noise: FrameNoise, row_std_dn: float
 ) -> NDArray[np.float32]:
-    """Offset of each row, DN, float32 [row].
+    """Offset of each row, float32 [row], DN.
 
     Parameters
     ----------

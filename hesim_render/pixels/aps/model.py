@@ -171,7 +171,7 @@ class ApsNoise(PlainState):
         return ""
 
     def value(self, electrons: Values, exposure_s: Values, pixels: PixelProperties, xp: Namespace) -> PixelValue:
-        """Law of the pixels' values, without N_FP and row noise, DN.
+        """Law of the pixels' values, DN, without N_FP and row noise.
 
         Parameters
         ----------

@@ -57,7 +57,7 @@ class TelegraphPixels:
         return np.where(high, *formulas.telegraph_levels(self.amplitude_dn, self.high_share)[::-1])
 
     def added_dn(self, seed: int, frame: int, pixels: int, index: UInt32) -> Float:
-        """Deviations from the mean in a frame on the device; 0 at pixels without telegraph noise, DN.
+        """Deviations from the mean in a frame on the device, DN; 0 at pixels without telegraph noise.
 
         Parameters
         ----------
