@@ -57,10 +57,6 @@ def build_benchmark(
     on_estimate : called with the estimate.
     progress : called with (done, total, what).
 
-    Returns
-    -------
-    The finished benchmark.
-
     Raises
     ------
     SpecError
@@ -195,10 +191,6 @@ def _plan_content(plan: BenchmarkPlan) -> dict[str, Any]:
 
 def opened(plan: BenchmarkPlan, out: Path) -> Path:
     """The folder of the benchmark, with its plan in it.
-
-    Parameters
-    ----------
-    plan, out : the plan, and the folder.
 
     Raises
     ------

@@ -39,10 +39,6 @@ def shares(items: Sequence[Item], weights: Sequence[float], key: str) -> list[li
     items : what is divided, in any order.
     weights : of the splits; their sum is 1.
     key : text that decides the order, such as the benchmark's seed.
-
-    Returns
-    -------
-    The items of each split.
     """
     order = sorted(items, key=lambda item: hashlib.sha256(f"{key}/{item}".encode()).digest())
     counts = [int(len(order) * weight) for weight in weights]

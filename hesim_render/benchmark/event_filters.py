@@ -57,17 +57,13 @@ def _newest(events: NDArray, shape: tuple[int, int], steps: list[tuple[int, int]
 
 
 def nearest_neighbour(events: NDArray, shape: tuple[int, int], support_us: int = SUPPORT_US) -> NDArray[np.bool_]:
-    """Keep an event if one of its 4 neighbours had an event of any polarity within the support time.
+    """Keep an event [event] if one of its 4 neighbours had an event of any polarity within the support time.
 
     Parameters
     ----------
     events : structured array of `EVENT_DTYPE`, in order of time.
     shape : rows and columns of the event grid.
     support_us : the support time, µs.
-
-    Returns
-    -------
-    [event], True for the kept ones.
     """
     steps = [(-1, 0), (1, 0), (0, -1), (0, 1)]
     return events["t_us"] - _newest(events, shape, steps) <= support_us

@@ -41,10 +41,6 @@ def flux_of(raw: NDArray, exposure_us: float, aps: ApsSpec, mosaic: Mosaic) -> E
     raw : [row, col], DN.
     exposure_us : its exposure, µs.
     aps, mosaic : gain and noise; black level and white level.
-
-    Returns
-    -------
-    The exposure.
     """
     seconds = exposure_us * 1e-6
     electrons = (raw.astype(np.float64) - mosaic.black_level_dn) / aps.system_gain_dn_per_e

@@ -122,12 +122,7 @@ def read_clip(folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class BenchmarkClip:
-    """A clip of a built benchmark; everything is read when it is asked for.
-
-    Parameters
-    ----------
-    folder : of the clip.
-    """
+    """A clip of a built benchmark; everything is read when it is asked for."""
 
     folder: Path
 

@@ -78,10 +78,6 @@ def _by_content(node: Any, files: dict[str, str]) -> Any:
 class Generator:
     """All generated scenes of a benchmark. Each is a pure function of the specification and its numbers.
 
-    Parameters
-    ----------
-    spec : the benchmark.
-
     Raises
     ------
     SpecError
@@ -143,12 +139,7 @@ class Generator:
         return [path for path in self._given[split] if path.suffix.lower() in kinds]
 
     def scene(self, scene: int, motion: int, light: int) -> GeneratedScene:
-        """One scene, with one of its motions and one of its lights.
-
-        Parameters
-        ----------
-        scene, motion, light : numbers, from 0 on.
-        """
+        """One scene, with one of its motions and one of its lights, all numbered from 0 on."""
         spec, seed, split = self.spec, self.spec.seed, self.split_of(scene)
         rng = draws(seed, SOLIDS, scene)
         palette = Palette(rng, spec.scenes, self._patches[split], self._pool(split, _PICTURES))

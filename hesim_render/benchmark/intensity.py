@@ -97,7 +97,7 @@ LEAK_US = 200_000.0
 def leaky_sum(
     events: NDArray, shape: tuple[int, int], t_us: float, thresholds: tuple[float, float], leak_us: float = LEAK_US
 ) -> NDArray[np.float64]:
-    """Log intensity of each pixel relative to its own past: steps that fade with time [scheerlinck2018].
+    """Log intensity of each pixel relative to its own past: steps that fade with time [scheerlinck2018], [y, x].
 
     Parameters
     ----------
@@ -106,10 +106,6 @@ def leaky_sum(
     t_us : time of the picture, µs.
     thresholds : contrast thresholds ON and OFF, ln units.
     leak_us : time in which a step falls to 1/e, µs.
-
-    Returns
-    -------
-    [y, x], ln units.
     """
     part = events[events["t_us"] <= t_us]
     steps = log_steps(part, *thresholds) * np.exp((part["t_us"] - t_us) / leak_us)

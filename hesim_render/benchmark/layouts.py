@@ -198,7 +198,7 @@ LAYOUTS: dict[str, Callable[[_Clip, str, Path], int]] = {
 def export_benchmark(
     root: str | Path, layout: str, out: str | Path, *, overwrite: bool = False, progress: Progress | None = None
 ) -> int:
-    """Write all clips with frames in the layout of another program's loader.
+    """Write all clips with frames in the layout of another program's loader; returns the number of pictures.
 
     Parameters
     ----------
@@ -207,10 +207,6 @@ def export_benchmark(
     out : folder to write; it appears whole or not at all.
     overwrite : replace an earlier export.
     progress : called with (done, total, what).
-
-    Returns
-    -------
-    The number of pictures.
 
     Raises
     ------

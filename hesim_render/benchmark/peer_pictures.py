@@ -98,10 +98,6 @@ def write_pictures(
     given : [y, x] each, e⁻/s.
     times_us : begin and end of each exposure, [picture, 2], µs.
     kinds : encodings and numbers of bits.
-
-    Returns
-    -------
-    The folder of each kind.
     """
     from PIL import Image
 

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,27 +28,8 @@ class PeerError(HesimError):
     """A peer that is there, but did not do what it should."""
 
 
-@dataclass(frozen=True)
-class PeerRun:
-    """What a peer did.
-
-    Parameters
-    ----------
-    events : structured array of `EVENT_DTYPE`, in order of time.
-    seconds : wall-clock time, with the start of its process, s.
-    """
-
-    events: NDArray[np.void]
-    seconds: float
-
-
 def program_of(peer: Peer, folder: Path) -> str | None:
-    """Path of the program of a peer; None if it is not installed here.
-
-    Parameters
-    ----------
-    peer, folder : the peer, and the folder of the file that names it.
-    """
+    """Path of the program of a peer whose file is in `folder`; None if it is not installed here."""
     first = peer.command[0]
     if len(Path(first).parts) > 1:
         path = (folder / Path(first).expanduser()).absolute()  # a link into a virtual environment is not followed
@@ -96,8 +76,8 @@ def version_of(peer: Peer, folder: Path) -> str:
 
 def run_peer(
     peer: Peer, folder: Path, pictures: Path, out: Path, shape: tuple[int, int], duration_us: float
-) -> PeerRun:
-    """Let a peer make events from pictures: ``COMMAND PICTURES OUT``.
+) -> tuple[NDArray[np.void], float]:
+    """Let a peer make events from pictures: ``COMMAND PICTURES OUT``; returns them, and its time with its start, s.
 
     Parameters
     ----------
@@ -114,7 +94,7 @@ def run_peer(
     begin = time.monotonic()
     _run(peer, folder, [str(pictures), str(out)], peer.timeout_s)
     seconds = time.monotonic() - begin
-    return PeerRun(read_events(out, shape, duration_us), seconds)
+    return read_events(out, shape, duration_us), seconds
 
 
 def read_events(path: Path, shape: tuple[int, int], duration_us: float) -> NDArray[np.void]:

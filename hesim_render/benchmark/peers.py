@@ -170,14 +170,15 @@ def _rows(
         given = pictures(scene, sensor, times, spec.seed, spec.quality)
         written = write_pictures(folder, given, times, [(peer.encoding, peer.bits) for peer in peers])
         for peer in peers:
-            write_settings(written[peer.encoding, peer.bits], _settings(peer, sensor, spec, fps))
+            given_to = written[peer.encoding, peer.bits]
+            write_settings(given_to, _settings(peer, sensor, spec, fps))
             out = folder / f"{peer.name}.npy"
             try:
-                run = run_peer(peer, spec.folder, written[peer.encoding, peer.bits], out, shape, spec.duration_us)
+                made, seconds = run_peer(peer, spec.folder, given_to, out, shape, spec.duration_us)
             except HesimError as error:
                 rows.append({"scene": name, "fps": fps, "peer": peer.name, "error": str(error)})
                 continue
-            rows.append(row(peer.name, _between(run.events, first, last), run.seconds))
+            rows.append(row(peer.name, _between(made, first, last), seconds))
     return rows
 
 

@@ -158,12 +158,7 @@ class ClipDevelopment:
         return channels.astype(np.float64) / (np.array(gains) / min(gains)) * span + black
 
     def channel_scores(self, channels: NDArray, truth: NDArray) -> dict[str, float]:
-        """Measures of a demosaiced frame against the truth, as those of `scores`.
-
-        Parameters
-        ----------
-        channels, truth : [row, col, channel], DN.
-        """
+        """Measures of a demosaiced frame [row, col, channel], DN, against the truth, as those of `scores`."""
         mosaic = self._clip.recording.mosaic
         black, span = mosaic.black_level_dn, mosaic.white_level_dn - mosaic.black_level_dn
         result = {"channel_psnr_db": psnr((channels - black) / span, (truth - black) / span)}
@@ -182,7 +177,7 @@ class ClipDevelopment:
 
 
 def bilinear(raw: NDArray, tile: ArrayLike) -> NDArray[np.float64]:
-    """Every channel at every pixel.
+    """Every channel at every pixel, [row, col, channel], DN.
 
     The tent falls to zero one tile away, so that every pixel has samples of every channel. On a Bayer tile this is the
     usual bilinear interpolation. Measured values stay as they are.
@@ -191,10 +186,6 @@ def bilinear(raw: NDArray, tile: ArrayLike) -> NDArray[np.float64]:
     ----------
     raw : [row, col], DN.
     tile : [tile_row, tile_col], channel number of each position from 0 on, -1 where there is no value.
-
-    Returns
-    -------
-    float64 [row, col, channel], DN.
     """
     block = np.asarray(tile)
     rows, cols = np.ogrid[: raw.shape[0], : raw.shape[1]]

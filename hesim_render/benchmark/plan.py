@@ -49,12 +49,7 @@ class Clip:
 
 
 class BenchmarkPlan:
-    """All clips of a benchmark. Scenes and sensors are made when a clip asks for them.
-
-    Parameters
-    ----------
-    spec : the benchmark.
-    """
+    """All clips of a benchmark. Scenes and sensors are made when a clip asks for them."""
 
     def __init__(self, spec: BenchmarkSpec) -> None:
         self.spec, self.generator = spec, Generator(spec)

@@ -43,10 +43,6 @@ def samples(clip: BenchmarkClip) -> Iterator[tuple[str, dict[str, NDArray], dict
     The events of a frame are those from the begin of its exposure to the begin of the next frame's; the first frame has
     those before it as well, the last one all to the end. A clip without frames is one sample.
 
-    Parameters
-    ----------
-    clip : the clip.
-
     Yields
     ------
     Name, arrays and figures. Arrays: ``raw`` (uint16, DN) and ``sharp`` (uint16, DN, of the sharp image nearest to the
@@ -169,7 +165,7 @@ def pack_benchmark(
 
     A folder appears whole or not at all. At an address a shard appears when all of it is written, and ``index.json``
     comes last: with it the set is whole. ``README.md`` has the header that hubs read. After an error no shard is left
-    there.
+    there. Returns the number of samples.
 
     Parameters
     ----------
@@ -179,10 +175,6 @@ def pack_benchmark(
     shard_mb : size at which a shard is closed, MB.
     overwrite : replace a finished set.
     progress : called with (done, total, what).
-
-    Returns
-    -------
-    The number of samples.
 
     Raises
     ------

@@ -67,7 +67,7 @@ def sharp_flux(
 def write_sharp(
     path: Path, source: FluxSource, sensor: Sensor, spec: SharpSpec, duration_us: int, seed: int, quality: float
 ) -> int:
-    """Write the sharp images of a clip.
+    """Write the sharp images of a clip; returns their number.
 
     Parameters
     ----------
@@ -77,10 +77,6 @@ def write_sharp(
     source, sensor : of the clip: the light with the lens and the crosstalk that its frames have.
     spec : times and windows.
     duration_us, seed, quality : of the clip. The error of a flux is that part of the noise of a whole exposure.
-
-    Returns
-    -------
-    The number of images.
     """
     aps = sensor.spec.aps
     assert aps is not None
@@ -183,7 +179,7 @@ def through_one_filter(sensor: Sensor, name: str) -> Sensor:
 def write_colours(
     path: Path, scene: Scene, sensor: Sensor, spec: SharpSpec, duration_us: int, seed: int, quality: float
 ) -> int:
-    """Write the full-colour truth of a clip.
+    """Write the full-colour truth of a clip; returns the number of images.
 
     Parameters
     ----------
@@ -192,10 +188,6 @@ def write_colours(
     scene, sensor : of the clip.
     spec : times and windows, those of the sharp images.
     duration_us, seed, quality : of the clip. Each filter has random numbers of its own.
-
-    Returns
-    -------
-    The number of images.
     """
     names, times = frame_filters(sensor), list(windows(sensor, spec, duration_us))
     every = np.arange(sensor.rows * sensor.cols, dtype=np.uint32)

@@ -38,12 +38,7 @@ def spans_of(duration_us: int, span_us: int) -> tuple[Span, ...]:
 
 
 def spans_folder(folder: Path) -> Path:
-    """Where the journals of the spans of a clip are, and their scenes while they are rendered.
-
-    Parameters
-    ----------
-    folder : of the clip.
-    """
+    """Where the journals of the spans of a clip are, and their scenes while they are rendered."""
     return folder.with_name(f".{short_name(folder)}.spans")
 
 
@@ -124,13 +119,7 @@ class Unit:
 
 
 class Waiting:
-    """Units in the order in which they are begun: the spans of each clip, then the clip, once all of them are done.
-
-    Parameters
-    ----------
-    clips : the clips.
-    spans : of each clip.
-    """
+    """Units in the order in which they are begun: the spans of each clip, then the clip, once all of them are done."""
 
     def __init__(self, clips: Iterable[Clip], spans: Sequence[Span] = ()) -> None:
         self._units = deque(Unit(clip, span) for clip in clips for span in (*spans, None))

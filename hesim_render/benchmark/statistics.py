@@ -25,13 +25,7 @@ _FLOW_US = 1000
 
 
 def figures(recording: Recording, scene: Scene, sensor: Sensor) -> dict[str, float | None]:
-    """The figures of a clip, None where a sensor has no such pixels.
-
-    Parameters
-    ----------
-    recording : the clip.
-    scene, sensor : of it.
-    """
+    """The figures of a clip, None where a sensor has no such pixels."""
     counts, seconds = recording.manifest["counts"], recording.duration_us / US_PER_S
     pixels = recording.event_shape[0] * recording.event_shape[1]
     result: dict[str, float | None] = dict.fromkeys(FIGURES)

@@ -31,7 +31,6 @@ class Store(Protocol):
         OutputError
             If there is a set and `overwrite` is False, or it cannot be written.
         """
-        ...
 
     def blocks(self, name: str) -> Iterator[bytes]:
         """The content of a file, in parts of one MiB.
@@ -41,16 +40,10 @@ class Store(Protocol):
         SpecError
             If it is not there, or cannot be read.
         """
-        ...
 
 
 class FolderStore:
-    """A folder of this machine, which appears whole or not at all.
-
-    Parameters
-    ----------
-    root : the folder.
-    """
+    """A folder of this machine, which appears whole or not at all."""
 
     def __init__(self, root: Path) -> None:
         self._root = root.expanduser().resolve()

@@ -69,7 +69,7 @@ def verify_benchmark(root: str | Path, progress: Progress | None = None) -> list
 
 
 def discard_damaged(root: str | Path, problems: Sequence[str]) -> list[str]:
-    """Remove the clips in which something is wrong, so that the next build makes them again.
+    """Remove the clips in which something is wrong, so that the next build makes them again; returns their names.
 
     The manifest is removed as well, because the set is not whole then. Folders that are no clips are left alone.
 
@@ -77,10 +77,6 @@ def discard_damaged(root: str | Path, problems: Sequence[str]) -> list[str]:
     ----------
     root : folder of the benchmark.
     problems : from `verify_benchmark`.
-
-    Returns
-    -------
-    Names of the removed clips.
     """
     benchmark = Benchmark(root)
     wrong = {line.split(":")[0].split("/")[0] for line in problems}

@@ -18,7 +18,7 @@ ALARM = 1e-4
 
 
 def estimated(value: float, standard_error: float, unit: str = "", groups: int | None = None) -> dict[str, Any]:
-    """A parameter with its 95 % interval; it is not identifiable where either number is not finite.
+    """A parameter of ``calibration.yaml`` with its 95 % interval; not identifiable where either number is not finite.
 
     Parameters
     ----------
@@ -27,10 +27,6 @@ def estimated(value: float, standard_error: float, unit: str = "", groups: int |
     unit : name of the unit, empty for a pure number.
     groups : number of groups of the jackknife that gave the standard error; its own scatter widens the interval, by
         Student's law with groups − 1 degrees of freedom (Tukey 1958). Without it the error counts as known.
-
-    Returns
-    -------
-    Entry of ``calibration.yaml``.
     """
     if not (np.isfinite(value) and np.isfinite(standard_error)):
         return not_identifiable("the estimate is not finite")

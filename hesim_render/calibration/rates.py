@@ -19,31 +19,23 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def rate_hz(probability: ArrayLike, interval_s: float) -> NDArray[np.float64]:
-    """Rate of the Poisson process that gives an event in an interval with this probability.
+    """Rate of the Poisson process that gives an event in an interval with this probability, Hz.
 
     Parameters
     ----------
     probability : probability of an event; 1 is taken as 1 − 1e-9.
     interval_s : Δt, s.
-
-    Returns
-    -------
-    Rate, Hz.
     """
     return -np.log1p(-np.clip(probability, 0.0, 1.0 - 1e-9)) / interval_s
 
 
 def change_hz(correlation: ArrayLike, interval_s: float) -> NDArray[np.float64]:
-    """Rate at which a telegraph signal forgets its state, from the correlation of the state over an interval.
+    """Rate at which a telegraph signal forgets its state, from the correlation of the state over an interval, Hz.
 
     Parameters
     ----------
     correlation : exp(−rate·Δt), taken to lie 1e-9 inside of 0 and 1.
     interval_s : Δt, s.
-
-    Returns
-    -------
-    Rate, Hz.
     """
     return -np.log(np.clip(correlation, 1e-9, 1.0 - 1e-9)) / interval_s
 

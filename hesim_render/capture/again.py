@@ -49,10 +49,6 @@ def simulate_again(
     scene : the scene, if it needs files that a recording does not hold.
     options : `overwrite`, `progress`, `on_estimate`, `max_minutes` and `resume` of `simulate`.
 
-    Returns
-    -------
-    The new recording.
-
     Raises
     ------
     SpecError

@@ -107,10 +107,6 @@ def set_up(
     illuminant : name of the light's spectrum.
     without : noise terms to switch off, as in `simulate`.
 
-    Returns
-    -------
-    The bench.
-
     Raises
     ------
     RangeError

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.sources.render.audit.audit import MOST_OFF, TOLERANCE
 
@@ -53,8 +54,6 @@ class ErrorMeter:
         half_a, half_b : Dr.Jit Float [n], electrons; the same array if a source has no error of this kind.
         noise : maps electrons [k] and places in the picture [k] to one standard deviation of the noise, electrons.
         """
-        import drjit as dr
-
         types, count = jit(), dr.width(half_a)
         if half_a is half_b or count == 0:
             return
@@ -74,12 +73,7 @@ class ErrorMeter:
         self.values += error.size
 
     def as_dict(self, wanted: float | None = None) -> dict[str, float] | None:
-        """Statistics for the manifest, in units of noise; None without values.
-
-        Parameters
-        ----------
-        wanted : error that was asked for, in units of noise.
-        """
+        """Statistics for the manifest, in units of noise, with the error that was `wanted`; None without values."""
         if not self.values:
             return None
         result = {"rms": float(np.sqrt(self._square / self.values))}
@@ -127,3 +121,26 @@ def stated_verdict(errors: Mapping[str, ErrorMeter], samples: int, wanted: float
         "verdict": "not met" if failed else "met",
         "samples_needed": 1 << int(np.ceil(np.log2(needed))) if failed else None,
     }
+
+
+class EventFlux:
+    """Truth of the event pixels: mean flux over all samples, with both halves kept apart."""
+
+    STATE = ("_half_a", "_half_b", "samples")
+
+    def __init__(self, count: int) -> None:
+        self._half_a, self._half_b = np.zeros(count), np.zeros(count)
+        self.samples = 0
+
+    def add(self, half_a: Float, half_b: Float) -> None:
+        self._half_a += np.array(half_a)
+        self._half_b += np.array(half_b)
+        self.samples += 1
+
+    def mean_e_per_s(self) -> NDArray[np.float32]:
+        """[event pixel], e⁻/s."""
+        return ((self._half_a + self._half_b) / (2 * max(1, self.samples))).astype(np.float32)
+
+    def stderr_e_per_s(self) -> NDArray[np.float32]:
+        """[event pixel], standard error of that mean from its two halves, e⁻/s."""
+        return (np.abs(self._half_a - self._half_b) / (2 * max(1, self.samples))).astype(np.float32)

@@ -41,12 +41,7 @@ class KeptRun:
         self._end_s = time.monotonic() + part_s
 
     def go_on(self, writer: RecordingWriter, progress: Progress | None = None) -> None:
-        """Give a writer what the journal holds, and let the capture begin after it.
-
-        Parameters
-        ----------
-        writer, progress : as for `Capture.record`.
-        """
+        """Give a writer what the journal holds, and let the capture begin after it; see `Capture.record`."""
         state = None
         while part := self._read("part", self._parts):
             frames, chunks = range(self._frames, part["frames"]), range(self._chunks, part["chunks"])
@@ -70,12 +65,7 @@ class KeptRun:
         self._end_s = time.monotonic() + self._part_s
 
     def keep(self, item: Frame | NDArray) -> None:
-        """Keep what `Capture.run` yields, before it is asked for more.
-
-        Parameters
-        ----------
-        item : a frame, or a block of events.
-        """
+        """Keep what `Capture.run` yields, a frame or a block of events, before it is asked for more."""
         match item:
             case Frame():
                 assert not np.any(item.electrons_stderr > 0)

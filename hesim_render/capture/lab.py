@@ -61,7 +61,7 @@ def write_captures(
     progress: Progress | None = None,
     on_estimate: Callable[[object], None] | None = None,
 ) -> Path:
-    """Run a calibration session and write its capture set, which appears whole or not at all.
+    """Run a calibration session and write its capture set, which appears whole or not at all; returns the folder.
 
     Parameters
     ----------
@@ -85,10 +85,6 @@ def write_captures(
     progress : called with (done, total, what).
     on_estimate : called with the size of the set before the session begins, a text; an exception that it raises ends
         the session before anything is written.
-
-    Returns
-    -------
-    The folder, absolute.
 
     Raises
     ------

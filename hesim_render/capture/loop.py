@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.capture.error_meter import ErrorMeter
-from hesim_render.capture.event_flux import EventFlux
+from hesim_render.capture.error_meter import ErrorMeter, EventFlux
 from hesim_render.capture.open_frames import OpenFrames, frame_pixels
 from hesim_render.core.device_types import Float
 from hesim_render.core.progress import Progress

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hesim_render.capture.error_meter import ErrorMeter
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.schedule import Exposure
@@ -100,8 +101,6 @@ class OpenFrames:
         """Add to each row the part of its exposure that lies in a piece. Yield the frame after its last piece."""
         frame = piece.frame
         if frame.half_a is None:
-            import drjit as dr
-
             frame.half_a, frame.half_b = (dr.zeros(jit().Float, self._pixel.size) for _ in range(2))
             self._open[frame.exposure.index] = frame
         self._add(frame, piece.begin_us, piece.end_us)
@@ -111,8 +110,6 @@ class OpenFrames:
             yield self._read_out(frame)
 
     def _add(self, frame: OpenFrame, begin_us: float, end_us: float) -> None:
-        import drjit as dr
-
         # the part of each row's exposure that lies in the piece, [row]; with a rolling shutter some rows have none
         starts = frame.exposure.row_begin_us(np.arange(self._sensor.rows))
         first = np.maximum(starts, begin_us)
@@ -132,8 +129,6 @@ class OpenFrames:
 
     def _read_out(self, frame: OpenFrame) -> Frame:
         """Draw the noise of a frame once, then put all values back on the mosaic."""
-        import drjit as dr
-
         assert self._aps is not None
         types = jit()
         layout = self._sensor.layout

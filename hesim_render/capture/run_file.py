@@ -126,10 +126,6 @@ def run(
     on_estimate : called with the estimate of the recording, or with a text where there is none; an exception that it
         raises ends the run before anything is written.
 
-    Returns
-    -------
-    The recording, and what else was written.
-
     Raises
     ------
     SpecError, RangeError

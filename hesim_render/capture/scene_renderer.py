@@ -9,7 +9,7 @@ from hesim_render.sources.render.camera import View
 from hesim_render.sources.render.change_driven.flux import QUALITY, ChangeDrivenFlux
 from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.renderer import SceneRenderer, flickering
-from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
+from hesim_render.sources.render.scene.builder import NeedsExactMode
 from hesim_render.sources.scene import Scene
 
 #: Default rays per pixel in the exact mode. A static scene is rendered once for the whole run,

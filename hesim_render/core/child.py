@@ -33,12 +33,7 @@ def python_command(code: str, *arguments: str) -> tuple[str, ...]:
 
 
 def with_package(code: str) -> str:
-    """A program text that may import this package, the one that runs now.
-
-    Parameters
-    ----------
-    code : the program text.
-    """
+    """A program text that may import this package, the one that runs now."""
     return _IMPORT.format(name=_PACKAGE.name, file=str(_PACKAGE / "__init__.py")) + code
 
 

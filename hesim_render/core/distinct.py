@@ -11,16 +11,7 @@ _Number = TypeVar("_Number", np.int64, np.float64)
 
 
 def distinct_pixels(*lists: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Mosaic indices that occur in any of some lists.
-
-    Parameters
-    ----------
-    lists : mosaic indices, [n] each.
-
-    Returns
-    -------
-    The indices in ascending order, each once.
-    """
+    """Mosaic indices that occur in any of some lists, [n] each, ascending."""
     size = max((int(pixel.max()) + 1 for pixel in lists if pixel.size), default=0)
     occurs = np.zeros(size, np.bool_)
     for pixel in lists:

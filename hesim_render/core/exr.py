@@ -14,10 +14,6 @@ _VALUE_BYTES = 8
 def exr_header(file: Path) -> tuple[tuple[int, int], dict[str, Any]]:
     """Width and height of an EXR file, and its header.
 
-    Parameters
-    ----------
-    file : the file.
-
     Raises
     ------
     SpecError
@@ -36,10 +32,6 @@ def exr_header(file: Path) -> tuple[tuple[int, int], dict[str, Any]]:
 
 def require_exr_fits(file: Path) -> None:
     """Refuse an EXR file that would not fit into memory, with all its channels.
-
-    Parameters
-    ----------
-    file : the file.
 
     Raises
     ------

@@ -115,10 +115,6 @@ def require_sound_heaps(path: Path) -> None:
     """Refuse a file whose heaps are damaged, before a text of variable length is read: HDF5 may walk along such a heap
     without end.
 
-    Parameters
-    ----------
-    path : the file.
-
     Raises
     ------
     SpecError

@@ -184,12 +184,7 @@ class Journal:
             self._other = None
 
     def read(self, key: bytes) -> bytes | None:
-        """The bytes of a known result, None where there is none.
-
-        Parameters
-        ----------
-        key : from `key_of`.
-        """
+        """The bytes of a known result (`key_of`), None where there is none."""
         if key not in self._places:
             return None
         path, begin, length, checksum = self._places[key]

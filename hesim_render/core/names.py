@@ -22,10 +22,6 @@ _EXPECTED = (
 def file_name(text: str) -> str:
     """The text, if it can be the name of a file or a folder, and of none outside of the folder that it is joined to.
 
-    Parameters
-    ----------
-    text : the name.
-
     Raises
     ------
     ValueError
@@ -39,10 +35,6 @@ def file_name(text: str) -> str:
 
 def path_below(text: str) -> str:
     """The text, if it is the path of a file below a folder: names (`file_name`) with ``/`` between them.
-
-    Parameters
-    ----------
-    text : the path.
 
     Raises
     ------

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 
 #: Length of the JSON text that comes first; the data of the arrays follow it in order.
 _LENGTH = struct.Struct("<Q")
@@ -75,12 +76,7 @@ def to_bytes(value: Any) -> bytes:
 
 
 def from_bytes(data: bytes) -> Any:
-    """The value that `to_bytes` was given; its arrays may be written to.
-
-    Parameters
-    ----------
-    data : from `to_bytes`.
-    """
+    """The value that `to_bytes` was given; its arrays may be written to."""
     (length,) = _LENGTH.unpack_from(data)
     begin = _LENGTH.size + length
     value, _ = _filled(json.loads(data[_LENGTH.size : begin]), data, begin)
@@ -108,8 +104,6 @@ def _outline(value: Any, arrays: list[NDArray]) -> Any:
 
 def _filled(outline: Any, data: bytes, begin: int) -> tuple[Any, int]:
     """The value of an outline, and the end of its data."""
-    import drjit as dr
-
     if not isinstance(outline, dict):
         return outline, begin
     ((kind, given),) = outline.items()

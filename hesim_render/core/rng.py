@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 
 _MASK64 = (1 << 64) - 1
@@ -81,8 +82,6 @@ def philox(seed: int, stream: Stream, pixel: Any, index: int = 0) -> Any:
     pixel : Dr.Jit UInt32, index of each pixel on the full sensor.
     index : frame or tick number (64 bits are used).
     """
-    import drjit as dr
-
     types = jit()
     key = dr.opaque(types.UInt64, stream_key(seed, stream))
     low = dr.opaque(types.UInt32, int(index) & 0xFFFFFFFF)
@@ -110,8 +109,6 @@ def device_uniform(seed: int, stream: Stream, index: np.ndarray) -> np.ndarray:
 
 def random_words(seed: int, stream: Stream, pixel: np.ndarray, index: np.ndarray, draw: np.ndarray) -> np.ndarray:
     """Four random words, uint32 [4, n], of each pixel with an index and a draw of its own, uint32 [n] each."""
-    import drjit as dr
-
     types = jit()
     key = dr.opaque(types.UInt64, stream_key(seed, stream))
     counters = (types.UInt32(np.ascontiguousarray(values, np.uint32)) for values in (pixel, index, draw))
@@ -138,8 +135,6 @@ def normal_pair(radius_word: UInt32, angle_word: UInt32) -> tuple[Float, Float]:
     -------
     first, second : Float, as many as there are words. An unused one costs nothing.
     """
-    import drjit as dr
-
     types = jit()
     uniform = dr.fma(types.Float(radius_word), 2.0**-32, 2.0**-33)
     sine, cosine = dr.sincos(types.Float(angle_word) * (math.tau * 2.0**-32))

@@ -36,10 +36,6 @@ def read_keys(file: Path, keys: Collection[str]) -> dict[str, Any]:
     Parameters
     ----------
     file, keys : the file, and the keys that are wanted.
-
-    Returns
-    -------
-    Those of the keys that the file has, with plain values.
     """
     from ruamel.yaml import YAML
 

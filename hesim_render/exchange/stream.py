@@ -59,10 +59,6 @@ class EventStream:
         events : structured array [event] of `EVENT_DTYPE`, in order of time.
         shape : rows and columns of the event grid, px.
         source : name of the events, for errors.
-
-        Returns
-        -------
-        The stream.
         """
         return cls(lambda: (events[k : k + BLOCK] for k in range(0, events.size, BLOCK)), shape, source)
 
@@ -137,12 +133,7 @@ class EventStream:
             before = events[-1]
 
     def count(self) -> int:
-        """Number of events; it reads all of them.
-
-        Returns
-        -------
-        The number of events.
-        """
+        """Number of events; it reads all of them."""
         return sum(events.size for events in self)
 
     def span_us(self) -> tuple[int, int]:

@@ -17,7 +17,7 @@ _DARKEST, _BRIGHTEST = 0.01, 0.95
 def white_balance(
     raw: NDArray[np.float32], tile: ArrayLike, gains: Sequence[float], clip: bool = True
 ) -> NDArray[np.float32]:
-    """A mosaic with each channel multiplied by its gain.
+    """A mosaic with each channel multiplied by its gain, float32 [row, col].
 
     Parameters
     ----------
@@ -26,10 +26,6 @@ def white_balance(
     gains : one per channel; used relative to the smallest.
     clip : clip all channels at 1, where the channel with the smallest gain saturates. Otherwise highlights turn
         magenta.
-
-    Returns
-    -------
-    float32 [row, col].
     """
     channels = np.asarray(tile)
     given = np.asarray(gains, dtype=np.float64)

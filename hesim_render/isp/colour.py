@@ -66,10 +66,6 @@ def fit_srgb_matrix(patches: ArrayLike, reference: ArrayLike) -> ColourFit:
     patches : [patch, channel], linear, black at 0, white-balanced, any exposure.
     reference : [patch, 3], linear sRGB.
 
-    Returns
-    -------
-    The matrix and its errors.
-
     Raises
     ------
     RangeError

@@ -30,7 +30,7 @@ _LONG_BLOCKS = 2.0
 def denoise(
     signal_dn: NDArray[np.float32], tile: ArrayLike, noise: FrameNoise, top_dn: float, balance: Sequence[float]
 ) -> NDArray[np.float32]:
-    """A mosaic with less temporal noise.
+    """A mosaic with less temporal noise, float32 [row, col], DN above black.
 
     Parameters
     ----------
@@ -39,10 +39,6 @@ def denoise(
     noise : noise of the sensor; its tile has the shape of `tile`.
     top_dn : signal at which pixels saturate, DN; saturated samples are kept.
     balance : gain of each channel that makes white equal in all.
-
-    Returns
-    -------
-    float32 [row, col], DN above black.
     """
     channels = np.asarray(tile)
     stabilisers = _stabilisers(noise, channels, top_dn)

@@ -21,16 +21,12 @@ _Offset = tuple[int, int]
 
 
 def fill_positions(raw: NDArray[np.float32], tile: ArrayLike, filled: ArrayLike) -> NDArray[np.float32]:
-    """RAW data with values at the positions that `filled` has and `tile` lacks.
+    """RAW data with values at the positions that `filled` has and `tile` lacks, float32 [row, col].
 
     Parameters
     ----------
     raw : [row, col], black at 0, white at 1.
     tile, filled : channel of each tile position before and after, -1 where there is none.
-
-    Returns
-    -------
-    float32 [row, col].
     """
     before, after = np.asarray(tile), np.asarray(filled)
     out = raw.copy()

@@ -16,17 +16,13 @@ def black_level(
     row_map_dn: ArrayLike | None = None,
     pixel_map_dn: ArrayLike | None = None,
 ) -> NDArray[np.float32]:
-    """RAW data with black at 0 and saturation at 1.
+    """RAW data with black at 0 and saturation at 1, float32 [row, col].
 
     Parameters
     ----------
     raw : [row, col], DN.
     black_level_dn, white_level_dn : levels of black and of saturation, DN.
     row_map_dn, pixel_map_dn : [row] and [row, col], offsets of rows and of pixels from the black level, DN.
-
-    Returns
-    -------
-    float32 [row, col].
     """
     span = white_level_dn - black_level_dn
     if span <= 0:

@@ -39,7 +39,7 @@ class _Comparison:
 def row_offsets(
     signal_dn: NDArray[np.float32], tile: ArrayLike, noise: FrameNoise, row_std_dn: float
 ) -> NDArray[np.float32]:
-    """Offset of each row, DN.
+    """Offset of each row, float32 [row], DN.
 
     Parameters
     ----------
@@ -47,10 +47,6 @@ def row_offsets(
     tile : channel of each position, -1 where there is no value.
     noise : temporal noise of the samples.
     row_std_dn : standard deviation of the offsets; 0 gives none.
-
-    Returns
-    -------
-    float32 [row].
     """
     channels = np.asarray(tile)
     height = signal_dn.shape[0]

@@ -42,10 +42,6 @@ def ssim(picture: NDArray, truth: NDArray) -> float:
     Parameters
     ----------
     picture, truth : [row, col] or [row, col, channel], at least 11 px on each side; clipped at 1.
-
-    Returns
-    -------
-    The mean over pixels and channels, at most 1.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -72,10 +68,6 @@ def delta_e(picture: NDArray, truth: NDArray) -> float:
     Parameters
     ----------
     picture, truth : [row, col, 3], linear sRGB; clipped at white, 1, and not at black.
-
-    Returns
-    -------
-    ΔE₀₀, mean over pixels.
     """
     a, b = below_peak(picture, truth, 1.0)
     return float(np.mean(delta_e_2000(a.reshape(-1, 3), b.reshape(-1, 3))))

@@ -219,10 +219,6 @@ def sample_of_blocks(
     stretch_us : length of a stretch, µs; blocks of the source begin and end at its multiples.
     begin_us, end_us : begin and end of the run, µs.
     seed : seed of the choice.
-
-    Returns
-    -------
-    The sample.
     """
     if end_us - begin_us <= _STRETCHES * stretch_us:
         return BlockSample(list(blocks(begin_us, end_us)), 1.0)

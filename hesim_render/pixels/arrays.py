@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import DeviceArray, Float, UInt32
 from hesim_render.core.errors import RangeError
 
@@ -23,8 +24,6 @@ def to_device(value: float | NDArray) -> Float:
     """Copy a value to the device: a number as an opaque Dr.Jit Float (a new one compiles nothing), an array as a flat
     Float.
     """
-    import drjit as dr
-
     types = jit()
     if np.ndim(value):
         return types.Float(np.ascontiguousarray(value, dtype=np.float32).ravel())
@@ -33,8 +32,6 @@ def to_device(value: float | NDArray) -> Float:
 
 def take(value: DeviceArray, index: UInt32) -> DeviceArray:
     """Entries `index` of a device array; a number stays a number."""
-    import drjit as dr
-
     return value if dr.width(value) == 1 else dr.gather(type(value), value, index)
 
 
@@ -54,8 +51,6 @@ def restore(part: Any, state: SavedState) -> None:
 
 
 def _off_device(value: Any) -> Any:
-    import drjit as dr
-
     if hasattr(value, "STATE"):
         return saved(value)
     if isinstance(value, tuple):

@@ -12,7 +12,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,10 +20,8 @@ from scipy import ndimage
 
 from hesim_render.core.errors import SpecError
 from hesim_render.recording.colour_view import colour_picture
+from hesim_render.recording.recorded import Recorded
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
-
-if TYPE_CHECKING:
-    from hesim_render.recording.recorded import Recorded
 
 #: Interval of boxes on the event grid, µs: that of DSEC-det.
 BOXES_EVERY_US = 50_000

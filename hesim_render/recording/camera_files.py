@@ -19,16 +19,12 @@ from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
 
 def write_opencv_camera(path: str | Path, camera: CameraModel) -> Path:
-    """Write a camera as `cv2.FileStorage` reads it: camera matrix, distortion coefficients, size.
+    """Write a camera as `cv2.FileStorage` reads it: camera matrix, distortion coefficients, size; returns the file.
 
     Parameters
     ----------
     path : YAML file to write.
     camera : the camera, as from `SceneTruth.camera`. Coefficients of a ``fisheye`` belong to `cv2.fisheye`.
-
-    Returns
-    -------
-    The file.
     """
     target = Path(path)
     matrices = {"camera_matrix": camera.k, "distortion_coefficients": np.atleast_2d([*camera.distortion] or [0.0] * 5)}
@@ -63,17 +59,13 @@ def _kalibr_camera(
 
 
 def write_kalibr_camchain(path: str | Path, truths: Sequence[SceneTruth], grids: Sequence[Grid]) -> Path:
-    """Write the cameras of a rig for Kalibr; the inertial unit is in the first one.
+    """Write the cameras of a rig for Kalibr; the inertial unit is in the first one; returns the file.
 
     Parameters
     ----------
     path : YAML file to write.
     truths : scene of each camera, as from `rig_scenes`.
     grids : grid of each, ``mosaic`` or ``events``.
-
-    Returns
-    -------
-    The file.
 
     Raises
     ------
@@ -94,7 +86,7 @@ def write_kalibr_camchain(path: str | Path, truths: Sequence[SceneTruth], grids:
 def write_kalibr_aprilgrid(
     path: str | Path, tag_cols: int, tag_rows: int, tag_size_m: float, tag_spacing: float
 ) -> Path:
-    """Write the description of an AprilGrid for Kalibr.
+    """Write the description of an AprilGrid for Kalibr; returns the file.
 
     Parameters
     ----------
@@ -102,10 +94,6 @@ def write_kalibr_aprilgrid(
     tag_cols, tag_rows : number of tags.
     tag_size_m : edge of a tag, m.
     tag_spacing : gap between tags over their edge.
-
-    Returns
-    -------
-    The file.
 
     Raises
     ------

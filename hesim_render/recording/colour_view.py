@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.mosaic.description import Mosaic
+from hesim_render.recording.recorded import Recorded
 from hesim_render.spectral.colorimetry import encode_srgb
-
-if TYPE_CHECKING:
-    from hesim_render.recording.recorded import Recorded
 
 Picture = NDArray[np.uint8]  # [row, col, 3], sRGB
 
@@ -24,10 +20,6 @@ def colour_picture(raw: NDArray[np.uint16], mosaic: Mosaic, max_width: int = 102
     raw : [row, col], DN.
     mosaic : description of the tile and its colours.
     max_width : wider frames are binned until they fit, px.
-
-    Returns
-    -------
-    uint8 [row, col, 3], sRGB.
     """
     tile_cols = mosaic.tile_shape[1]
     if raw.shape[1] <= max_width:

@@ -18,12 +18,11 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import MOST_PIXELS, MOST_TEXT_BYTES, WholeFile, leads_out, printable, reading
-from hesim_render.recording.series import Series
 
 #: The name that the standard's own data sets give the list.
 DATA_FILE = "EMVA1288_Data.txt"
@@ -39,6 +38,36 @@ _UNIT = re.compile(r"(?<=[0-9.])\s*(ns|us|µs|μs|ms|s)(?=$|[\s;,])", re.IGNOREC
 _SIZE_LINE = re.compile(r"^\s*n[\s;,]+\d+[\s;,]+\d+[\s;,]+\d+[\s;,]*$", re.IGNORECASE | re.MULTILINE)
 #: Decimals of an exposure in s that are kept, so that 40.5 µs and 40500 ns are one.
 _DECIMALS = 13
+
+
+@dataclass(frozen=True)
+class Series:
+    """Frames of one light and exposure.
+
+    Attributes
+    ----------
+    lit : whether light fell on the sensor.
+    exposure_s : exposure, s.
+    photons : mean photons per pixel and exposure; None where it is not stated.
+    files : the frames.
+    where, line : file and line that state them, for messages.
+    """
+
+    lit: bool
+    exposure_s: float
+    photons: float | None
+    files: tuple[Path, ...]
+    where: Path
+    line: int | None
+
+    def error(self, text: str) -> SpecError:
+        """An error of these frames, with file and line."""
+        return SpecError(f"{self.label}: {text}", file=self.where, line=self.line)
+
+    @property
+    def label(self) -> str:
+        light = "dark" if not self.lit else "lit" if self.photons is None else f"{self.photons:g} photons"
+        return f"{light}, {self.exposure_s * 1e6:g} µs"
 
 
 def find_list(folder: Path) -> Path | None:
@@ -205,12 +234,7 @@ def numbers(
 
 
 class _Pictures:
-    """Pictures of a list by the names that it gives them.
-
-    Parameters
-    ----------
-    file : the list; its folder holds them.
-    """
+    """Pictures in the folder of a list, by the names that the list gives them."""
 
     def __init__(self, file: Path) -> None:
         self._file, self._folder = file, file.parent

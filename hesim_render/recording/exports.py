@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,7 @@ from hesim_render.exchange.dsec import stream_events
 from hesim_render.exchange.triggers import exposure_triggers
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.recording.movie import write_movie
-
-if TYPE_CHECKING:
-    from hesim_render.recording.recorded import Recorded
+from hesim_render.recording.recorded import Recorded
 
 #: File that says what the frames of a folder are, and marks the folder for `overwrite`.
 FRAMES_NAME = "frames.json"
@@ -161,10 +158,6 @@ def import_events(
     shape : rows and columns of the event grid, px; needed if the file does not state them.
     overwrite : replace an existing file.
 
-    Returns
-    -------
-    The file written, absolute.
-
     Raises
     ------
     OutputError
@@ -232,15 +225,12 @@ def write_tick_files(recording: Recorded, folder: Path, tick_us: int | None) -> 
 
     H-ESIM has frames as ``raw`` and events as ``events``, -1, 0 or +1; RGB-Event-ISP has ``aps_raw`` and ``event_raw``,
     0, 1 (OFF) or 2 (ON). Each file has both. Of two events of a pixel in one tick the later one counts.
+    Returns the number of frames.
 
     Parameters
     ----------
     recording, folder : the recording, and a folder, which is made.
     tick_us : interval of the comparisons, µs; None writes frames alone.
-
-    Returns
-    -------
-    The number of frames.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for frame in recording.frames:

@@ -54,10 +54,6 @@ def import_recording(
     from_zero : count times from the begin of the recording, not by the camera's clock, which may be the time of day.
     overwrite : replace an existing recording.
 
-    Returns
-    -------
-    The recording.
-
     Raises
     ------
     OutputError

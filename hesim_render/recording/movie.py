@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,9 +12,7 @@ from hesim_render.core.errors import RangeError
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.recording.colour_view import Picture, black_picture, colour_picture, events_picture
 from hesim_render.recording.preview import magnified
-
-if TYPE_CHECKING:
-    from hesim_render.recording.recorded import Recorded
+from hesim_render.recording.recorded import Recorded
 
 #: Pictures per second of the video, and time that one shows where there are no frames, µs.
 _FPS, _STEP_US = 25, 10_000
@@ -32,6 +29,7 @@ def write_movie(recording: Recorded, path: Path, kind: str) -> int:
     """Write an MP4 file (H.264) with a picture for each frame, or for each 10 ms where there are no frames.
 
     Without frames there are at most 6000 pictures: those of a recording of more than a minute show longer times.
+    Returns the number of pictures.
 
     A recording that gives fewer than 50 of them has several pictures for each, in equal steps of time, so that what
     is short plays for two seconds. The events of a picture are those since the one before, over the frame that ends
@@ -41,10 +39,6 @@ def write_movie(recording: Recorded, path: Path, kind: str) -> int:
     ----------
     recording, path, kind : recording, file, and ``mp4`` (events over the colour view), ``mp4-colour`` or
         ``mp4-events``.
-
-    Returns
-    -------
-    The number of pictures.
 
     Raises
     ------

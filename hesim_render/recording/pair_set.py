@@ -20,9 +20,8 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out, printable
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.camera_raw import RAW_SUFFIXES
-from hesim_render.recording.emva_list import find_list, numbers, read_list
+from hesim_render.recording.emva_list import Series, find_list, numbers, read_list
 from hesim_render.recording.grey_picture import PICTURE_SUFFIXES, grey_size, read_grey
-from hesim_render.recording.series import Series
 from hesim_render.specs.capture import CaptureSpec
 from hesim_render.specs.files import read_spec
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,7 @@ from hesim_render.core.errors import SpecError, how_to_install
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.colour_view import OFF_COLOUR, ON_COLOUR, colour_picture
-
-if TYPE_CHECKING:
-    from hesim_render.recording.recorded import Recorded
+from hesim_render.recording.recorded import Recorded
 
 TIMELINE = "recording"
 #: Length of a step of events, µs.

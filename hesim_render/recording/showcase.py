@@ -7,7 +7,6 @@ of four colours say, becomes linear sRGB with a pixel for each tile.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +27,9 @@ from hesim_render.recording.colour_view import (
     thumbnail,
 )
 from hesim_render.recording.dng import write_dng, write_linear_dng
+from hesim_render.recording.frame import Frame
 from hesim_render.recording.preview import Panel
-
-if TYPE_CHECKING:
-    from hesim_render.recording.frame import Frame
-    from hesim_render.recording.recorded import Recorded
+from hesim_render.recording.recorded import Recorded
 
 #: Length of the window of events that is shown for a moving scene, µs.
 WINDOW_US = 10_000
@@ -173,12 +170,7 @@ def _ms(microseconds: int) -> str:
 
 
 def write_preview_dng(path: Path, frame: Frame, mosaic: Mosaic) -> None:
-    """Write the file of a frame whose own DNG developers do not open (`needs_preview`).
-
-    Parameters
-    ----------
-    path, frame, mosaic : file, frame, and its tile.
-    """
+    """Write the file of a frame whose own DNG developers do not open (`needs_preview`)."""
     smaller = binned(frame.raw, mosaic)
     if smaller is not None and smaller[1].tile_code.max() < _THREE:
         raw, own = smaller

@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,11 @@ from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.box_export import write_coco, write_dsec_det, write_prophesee_boxes
 from hesim_render.recording.camera_files import write_kalibr, write_kalibr_camchain, write_opencv_camera
+from hesim_render.recording.recorded import Recorded
 from hesim_render.recording.truth_file import IMAGES, POSE_STEP_US, images_at
 from hesim_render.sources.render.truth.imu import ImuModel
 from hesim_render.sources.render.truth.raster import Grid
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
-
-if TYPE_CHECKING:
-    from hesim_render.recording.recorded import Recorded
 
 MARKER = "export.json"
 #: DSEC's flow: 16 bit, 1/128 px, zero at 2¹⁵; interval of its flow, µs.
@@ -37,7 +35,7 @@ _DSEC_ZERO, _DSEC_STEPS, DSEC_EVERY_US = 1 << 15, 128.0, 100_000
 def export_truth(
     recording: Recorded, format_: str, out: str | Path, *, every_us: int | None = None, overwrite: bool = False
 ) -> Path:
-    """Write the geometric truth of a recording in a format that others read.
+    """Write the geometric truth of a recording in a format that others read; returns the folder.
 
     Parameters
     ----------
@@ -48,10 +46,6 @@ def export_truth(
     out : folder to write.
     every_us : interval of flow (default 100 000), of poses (default 1000) or of boxes (default 50 000), µs.
     overwrite : replace an existing export.
-
-    Returns
-    -------
-    The folder.
 
     Raises
     ------
@@ -178,10 +172,6 @@ def tum_lines(t_us: NDArray[np.float64], poses: NDArray[np.float64]) -> list[str
     ----------
     t_us : [n], µs.
     poses : [n, 4, 4], to world.
-
-    Returns
-    -------
-    One line for each pose, without line ends.
     """
     quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     rows = np.concatenate([poses[:, :3, 3], quaternion], axis=1)

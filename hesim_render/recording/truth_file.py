@@ -247,10 +247,6 @@ def _write_series(file: Any, truth: SceneTruth, request: TruthRequest) -> None:
 class StoredTruth:
     """Geometric truth as it was written into a recording; each call reads what it returns.
 
-    Parameters
-    ----------
-    path : the file.
-
     Raises
     ------
     SpecError

@@ -96,12 +96,7 @@ class RecordingWriter:
         return named
 
     def add_frame(self, frame: Frame) -> None:
-        """Add the next frame; frames come in order of time.
-
-        Parameters
-        ----------
-        frame : the frame, with its truth.
-        """
+        """Add the next frame, with its truth; frames come in order of time."""
         if self._folder is not None:
             self._folder.add_frame(frame)
         else:
@@ -143,12 +138,7 @@ class RecordingWriter:
             self._truth = truth
 
     def add_event_labels(self, block: LabelBlock) -> None:
-        """Add the labels of the events since the previous block, after these events.
-
-        Parameters
-        ----------
-        block : may change labels of earlier events, too.
-        """
+        """Add the labels of the events since the previous block, after these events; earlier ones may change."""
         if self._folder is not None:
             self._folder.add_event_labels(block)
         else:
@@ -166,23 +156,13 @@ class RecordingWriter:
             self._folder.set_event_objects(truth.objects_at)
 
     def set_events_dropped(self, count: int) -> None:
-        """Set how many events were lost in the read-out. No other count includes them.
-
-        Parameters
-        ----------
-        count : number of lost events.
-        """
+        """Set how many events were lost in the read-out. No other count includes them."""
         if self._folder is not None:
             self._folder.set_events_dropped(count)
         self._dropped = int(count)
 
     def add_settings(self, settings: Mapping[str, Any]) -> None:
-        """Add settings that are known only after the run, to those given at the start.
-
-        Parameters
-        ----------
-        settings : names and plain values.
-        """
+        """Add settings (names and plain values) that are known only after the run, to those given at the start."""
         for manifest in (self._manifest, *([self._folder.manifest] if self._folder is not None else [])):
             manifest["settings"] = {**manifest["settings"], **settings}
 

@@ -64,12 +64,7 @@ class FrameFigures:
 
 
 def frame_figures(folder: str | Path) -> FrameFigures:
-    """Evaluate EMVA 1288 captures.
-
-    Parameters
-    ----------
-    folder : of the captures.
-    """
+    """Evaluate EMVA 1288 captures."""
     result = evaluate(read_pair_set(folder))
     section = content(result)
     names = (

@@ -67,10 +67,6 @@ def make_report(
     overwrite : replace an existing report.
     progress : called with a text that names the current work and the fraction done.
 
-    Returns
-    -------
-    The report.
-
     Raises
     ------
     RangeError

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.tables import table as device_table
@@ -191,8 +192,6 @@ def _of_own(responses: NDArray[np.float64], widths: NDArray[np.float64]) -> NDAr
 
 def _own_table(responses: Float, widths: NDArray[np.float64]) -> Float:
     """The same on Dr.Jit, flat; differentiable."""
-    import drjit as dr
-
     types = jit()
     count = int(np.prod(responses.shape))
     bands = widths.shape[1]
@@ -228,8 +227,6 @@ def _numpy(radiance: NDArray, weights: NDArray, sensor: Sensor, filter: str | No
 
 
 def _drjit(radiance: Float, table: Float, sensor: Sensor, filter: str | None) -> Float:
-    import drjit as dr
-
     types = jit()
     shape = tuple(radiance.shape)
     bands = shape[-1]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Halves, UInt32
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.protocol import FluxSource, Sample
@@ -103,8 +104,6 @@ class CrosstalkFlux:
         )
 
     def _mix(self, halves: Halves, index: list[UInt32]) -> Halves:
-        import drjit as dr
-
         types = jit()
         result = []
         for half in halves:

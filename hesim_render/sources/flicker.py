@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Halves
 from hesim_render.mosaic.schedule import CELL_US, Block, blocks_of_run
 from hesim_render.sources.protocol import AuditableFlux, FluxSource, Sample
@@ -134,8 +135,6 @@ class FlickerFlux:
 
     def _pieces(self, pixel: NDArray[np.uint32], begin: NDArray, end: NDArray, bounds: NDArray[np.float64]) -> Halves:
         """As `_piece`, piece by piece. A pixel takes part in the pieces that overlap its interval."""
-        import drjit as dr
-
         types = jit()
         begin, end = (np.broadcast_to(times, pixel.shape) for times in (begin, end))
         length = end - begin
@@ -271,8 +270,6 @@ class FlickerFlux:
 
 def _weighted(halves: Sequence[Halves], weights: Sequence[ArrayLike]) -> Halves:
     """Σ weight · half, for both halves; a weight is a number, or one number per pixel."""
-    import drjit as dr
-
     types = jit()
     # opaque: a literal number would make a new kernel at every time
     factors = [

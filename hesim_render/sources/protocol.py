@@ -48,14 +48,12 @@ class FluxSource(Protocol):
         Between two edges a source may be frozen (object poses), so a `mean_flux` call must not span an edge. The result
         is empty for a source that takes intervals of any length.
         """
-        ...
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly between `begin_us` and `end_us` that are dense enough to follow the motion, µs.
 
         The image moves about half a pixel or less from one time to the next. The result is empty for a static source.
         """
-        ...
 
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """Mean Φ of each listed pixel over its own interval, e⁻/s.
@@ -72,7 +70,6 @@ class FluxSource(Protocol):
             Therefore add up each half over time and compare the sums; do not add the errors of slices. Exact sources
             return the same array twice.
         """
-        ...
 
     def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
         """Windows in which the pixels of a sensor without a tick are sampled.
@@ -90,7 +87,6 @@ class FluxSource(Protocol):
         ------
         Blocks of windows, in order of time.
         """
-        ...
 
     def flux_of_blocks(self, pixel: NDArray[np.uint32], blocks: Iterable[Block]) -> Iterator[Sample]:
         """Φ of the same pixels in the wanted windows of successive blocks, one after another.
@@ -104,7 +100,6 @@ class FluxSource(Protocol):
         ------
         One `Sample` per wanted window.
         """
-        ...
 
 
 @runtime_checkable
@@ -114,11 +109,9 @@ class AuditableFlux(FluxSource, Protocol):
     @property
     def rays_traced(self) -> int:
         """Number of rays traced so far."""
-        ...
 
     def still_pixels(self, pixel: NDArray[np.uint32]) -> NDArray[np.bool_]:
         """Event pixels [n] that are known to be constant: no moving object can come near them at any time."""
-        ...
 
     def reference_flux(
         self,
@@ -141,8 +134,6 @@ class AuditableFlux(FluxSource, Protocol):
         -------
         [2, n], e⁻/s: the flux, and half the difference of its two halves.
         """
-        ...
 
     def noise_unit(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64], events: bool) -> NDArray[np.float64]:
         """Change of flux equal to one standard deviation of each pixel's noise, at a flux [..., n], e⁻/s."""
-        ...

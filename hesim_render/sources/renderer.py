@@ -26,27 +26,22 @@ class Renderer(FluxSource, Protocol):
     @property
     def sensor(self) -> Sensor:
         """The sensor, with the lens in use."""
-        ...
 
     @property
     def settings(self) -> dict[str, object]:
         """How the source works, for the manifest: plain values."""
-        ...
 
     @property
     def quality(self) -> float | None:
         """Wanted error over the sensor's noise; None where no error is asked for."""
-        ...
 
     @property
     def auditable(self) -> AuditableFlux | None:
         """The source, if its values can be estimated again with other random numbers."""
-        ...
 
     @property
     def work(self) -> dict[str, float]:
         """Work done so far, for the manifest; empty where nothing is counted."""
-        ...
 
     def estimate(self, demand: Demand, progress: Progress | None = None) -> Estimate:
         """Time and memory of a run. What is computed for it changes no value.
@@ -56,7 +51,6 @@ class Renderer(FluxSource, Protocol):
         demand : what the run asks for.
         progress : called with (done, total, what).
         """
-        ...
 
     def report(self, demand: Demand, expected: Estimate | None, progress: Progress) -> None:
         """Report the rays of what rests, which is one long render; nothing else is reported.
@@ -66,7 +60,6 @@ class Renderer(FluxSource, Protocol):
         demand, expected : what the run asks for, and the estimate of it, if there is one.
         progress : called with (done, total, what).
         """
-        ...
 
     def go_on(self, journal: Journal, part: int = 0) -> None:
         """Keep what is traced in a journal, and take from it what is there already.
@@ -76,7 +69,6 @@ class Renderer(FluxSource, Protocol):
         journal : of the run.
         part : number of this part of the light.
         """
-        ...
 
 
 class Untraced:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Halves
 from hesim_render.core.distinct import distinct_pixels
 from hesim_render.core.errors import RangeError
@@ -97,8 +98,6 @@ class Kept:
 
     def halves(self, pixel: NDArray[np.uint32]) -> list[Halves]:
         """Both halves of each source, Dr.Jit Float [n] each."""
-        import drjit as dr
-
         types = jit()
         self._reach(int(pixel.max()) + 1 if pixel.size else 0)
         if not self._known[pixel].all():
@@ -116,8 +115,6 @@ class Kept:
 
     def _reach(self, size: int) -> None:
         """Make room for mosaic indices below `size`."""
-        import drjit as dr
-
         missing = size - self._known.size
         if missing <= 0:
             return

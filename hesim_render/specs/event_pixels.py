@@ -129,12 +129,7 @@ class LeakSpec(Strict):
         return self
 
     def mean_rate_hz(self, signal_dn: float) -> float:
-        """Rate of the leak of pixels of nominal threshold, mean over pixels, Hz.
-
-        Parameters
-        ----------
-        signal_dn : signal, DN.
-        """
+        """Rate of the leak of pixels of nominal threshold in a signal, DN, mean over pixels, Hz."""
         if self.tail_hz == 0:
             return self.rate_hz + self.rate_hz_per_dn * signal_dn
         most = MOST_TAIL_HZ / (self.tail_hz + MOST_TAIL_HZ)

@@ -34,10 +34,6 @@ def spec_error(
     data : the content.
     file : the file that `data` is from.
     overrides : dotted keys that did not come from the file.
-
-    Returns
-    -------
-    One error with all problems.
     """
     result: dict[tuple[int, str, str], SpecError] = {}
     problems = _once(error.errors(include_url=False), data)

@@ -242,10 +242,6 @@ def read_scene(
     overrides : dotted keys and their values.
     allow_outside : let the scene name files (spectra, meshes, textures, includes) outside its folder.
 
-    Returns
-    -------
-    The validated content.
-
     Raises
     ------
     SpecError

@@ -164,10 +164,6 @@ def surfaces_of(text: str) -> dict[str, str]:
     Parameters
     ----------
     text : name of a shipped scene or of a set, or a path; paths are relative to the working folder.
-
-    Returns
-    -------
-    The entry of a study's file.
     """
     from hesim_render.specs.files import list_names
 

@@ -84,10 +84,6 @@ def lab_of(ratios: Triple, xp: Namespace = NUMPY) -> Triple:
     ----------
     ratios : X/X_n, Y/Y_n, Z/Z_n, arrays of one library.
     xp : its functions.
-
-    Returns
-    -------
-    L*, a*, b*.
     """
 
     def curve(ratio: Values) -> Values:
@@ -105,10 +101,6 @@ def delta_e_2000_of(first: Triple, second: Triple, xp: Namespace = NUMPY) -> Val
     ----------
     first, second : L*, a*, b* of the colours, arrays of one library.
     xp : its functions.
-
-    Returns
-    -------
-    The difference of each pair.
     """
     (l1, a1, b1), (l2, a2, b2) = first, second
     mean_chroma = (xp.sqrt(a1 * a1 + b1 * b1) + xp.sqrt(a2 * a2 + b2 * b2)) / 2

@@ -58,10 +58,6 @@ def dye_transmittance(bands: ArrayLike = (), edges: ArrayLike = (), grid_nm: NDA
     edges : [n, 3], D/(1 + exp((λ₀ − λ)/w)): place λ₀ in nm, width w in nm, absorbance D far beyond. With a positive
         width light longer than λ₀ is absorbed, with a negative one shorter light.
     grid_nm : wavelengths of the result, nm.
-
-    Returns
-    -------
-    Transmittance, 0 to 1.
     """
     absorbance = np.zeros_like(grid_nm)
     for centre, width, density in np.reshape(bands, (-1, 3)):
@@ -88,10 +84,6 @@ def thin_film_transmittance(
     incidence_index, substrate_index : refractive indices in front of the stack and behind it.
     angle_deg : of incidence, degrees.
     grid_nm : wavelengths of the result, nm.
-
-    Returns
-    -------
-    Transmittance, 0 to 1.
     """
     stack = [incidence_index, *indices, substrate_index]
     _, passed = colour_science().phenomena.multilayer_tmm(stack, list(thicknesses_nm), grid_nm, angle_deg)

@@ -29,26 +29,21 @@ class Waveform(Protocol):
     @property
     def is_constant(self) -> bool:
         """True if it is 1 at all times."""
-        ...
 
     @property
     def highest(self) -> float:
         """Highest value, 1 or more."""
-        ...
 
     def mean(self, begin_us: ArrayLike, end_us: ArrayLike) -> NDArray[np.float64]:
         """Mean over each interval in closed form, arrays of any compatible shapes; the value at `begin_us` if it is
         empty.
         """
-        ...
 
     def follow_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly inside an interval between which ln w is linear to `FOLLOW_TOLERANCE`; jumps are included."""
-        ...
 
     def jumps_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly inside an interval at which w jumps."""
-        ...
 
 
 def _inside(times_us: NDArray[np.float64], begin_us: float, end_us: float) -> NDArray[np.float64]:

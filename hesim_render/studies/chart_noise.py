@@ -36,16 +36,12 @@ class NoisyChart:
     tile_px: int
 
     def balanced(self, white_e: NDArray[np.float64], area_px: float) -> NDArray[np.float64]:
-        """Channels with white at 1, with the noise of an area other than a tile: deviations from the mean are scaled.
+        """`channels` with white at 1, with the noise of an area other than a tile: deviations from the mean are scaled.
 
         Parameters
         ----------
         white_e : [channel], electrons of one pixel on a perfect white.
         area_px : pixels that share one output pixel.
-
-        Returns
-        -------
-        [repeat, patch, tile, channel].
         """
         mean = self.channels.mean(axis=(0, 2), keepdims=True)
         return (mean + (self.channels - mean) * sqrt(self.tile_px / area_px)) / white_e
@@ -74,10 +70,6 @@ def noisy_chart(
     patch_px : side of a patch, about; it is rounded up to whole tiles.
     crosstalk : part of a pixel's electrons that its neighbours collect.
     seed : of the noise.
-
-    Returns
-    -------
-    The channels.
 
     Raises
     ------

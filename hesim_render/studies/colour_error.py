@@ -65,17 +65,13 @@ class ColourError:
 
 
 def expanded(camera: ArrayLike, expansion: Expansion = "linear") -> NDArray[np.float64]:
-    """The terms that a matrix is applied to.
+    """The terms that a matrix is applied to, [..., term].
 
     Parameters
     ----------
     camera : [..., channel].
     expansion : ``linear`` gives the channels; ``root_polynomial`` appends √(c_i c_j) of all pairs [finlayson2015],
         which grow with the exposure as the channels do.
-
-    Returns
-    -------
-    [..., term].
     """
     values = np.asarray(camera, dtype=np.float64)
     if expansion == "linear":
@@ -254,7 +250,7 @@ def to_srgb(matrix: ArrayLike, white_xyz: ArrayLike) -> NDArray[np.float64]:
 
 
 def noise_aware_matrix(samples: ColourSamples, white_e: ArrayLike, noise: ChannelNoise) -> NDArray[np.float64]:
-    """The matrix to XYZ with the least squared error over surfaces, noise included (Wiener's filter).
+    """The matrix to XYZ with the least squared error over surfaces, noise included (Wiener's filter), [3, channel].
 
     M = (Σ x cᵀ)(Σ c cᵀ + Σ diag Var c)⁻¹ over the surfaces: it gives up colour where noise would cost more. Its second
     row is the best estimate of the luminance, also of cameras that see no colour.
@@ -264,10 +260,6 @@ def noise_aware_matrix(samples: ColourSamples, white_e: ArrayLike, noise: Channe
     samples : the surfaces.
     white_e : [channel], electrons of one pixel on a perfect white.
     noise : of the channels.
-
-    Returns
-    -------
-    [3, channel].
     """
     white = np.asarray(white_e, dtype=np.float64)
     variance = noise.variance_e2(np.maximum(samples.camera, 0) * white) / white**2

@@ -59,10 +59,6 @@ def colour_samples(
     >>> samples.camera.shape, samples.xyz.shape, samples.white_xyz.round(3).tolist()
     ((24, 3), (24, 3), [0.95, 1.0, 1.089])
 
-    Returns
-    -------
-    The samples.
-
     Raises
     ------
     SpecError

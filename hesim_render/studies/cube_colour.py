@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import device_namespace
 from hesim_render.core.errors import SpecError
 from hesim_render.core.tables import table
@@ -119,8 +120,6 @@ def cube_figures(
 
 def _lab_on_device(ratios: NDArray[np.float32]) -> Triple:
     """CIELAB of X, Y and Z over white, [3, texel], as device arrays."""
-    import drjit as dr
-
     x, y, z = (table(jit().Float, row) for row in ratios)
     result = lab_of((x, y, z), device_namespace())
     dr.eval(*result)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float64
 from hesim_render.core.errors import SpecError, did_you_mean
 from hesim_render.core.tables import table
@@ -21,7 +22,7 @@ from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectral.physical import silicon_quantum_efficiency
 from hesim_render.studies.colour_noise import channel_noise
 from hesim_render.studies.colour_samples import reflectances_of
-from hesim_render.studies.design_cost import Condition, DesignCost, Weights
+from hesim_render.studies.design_cost import Condition, DesignCost
 from hesim_render.studies.design_filters import Dyes, Family, FreeCurves, ThinFilms
 from hesim_render.studies.design_tile import repeated
 from hesim_render.studies.filter_sets import filters_of, with_filter_set
@@ -58,10 +59,6 @@ class DesignResult:
 
 class Problem:
     """Parameters, constraints and cost of a design.
-
-    Parameters
-    ----------
-    spec : the design.
 
     Raises
     ------
@@ -138,13 +135,11 @@ class Problem:
             channel_noise(sensor, self.frames, exposure_us, spec.area_px),
             [self.names.index(name) for name in self.frames],
             [self.names.index(name) for name in events], scale, window_us,
-            Weights(spec.cost.colour, spec.cost.noise, spec.cost.events),
+            spec.cost,
         )  # fmt: skip
 
     def transmittances(self, parameters: Float64) -> dict[str, Float64]:
         """Transmittance of each varied filter from all parameters, each 0 to 1 between its bounds."""
-        import drjit as dr
-
         types = jit()
         bounds = self.family.bounds()
         curves = {}
@@ -158,8 +153,6 @@ class Problem:
 
     def shares(self, parameters: Float64) -> list[Float64]:
         """Share of each frame filter in the frame pixels, at least `share_min`, sum 1."""
-        import drjit as dr
-
         first = parameters.shape[0] - len(self.frames)
         types = jit()
         weights = [
@@ -171,16 +164,12 @@ class Problem:
 
     def depth_um(self, parameters: Float64) -> Float64:
         """Depth of the silicon, µm."""
-        import drjit as dr
-
         assert self.spec.silicon_depth_um is not None
         low, high = self.spec.silicon_depth_um
         return low + (high - low) * dr.gather(jit().Float64, parameters, jit().UInt32(self.filter_size))
 
     def _light(self, parameters: Float64) -> Float64:
         """Response at the bands of a pixel without a filter, with the depth of the silicon."""
-        import drjit as dr
-
         light = table(jit().Float64, self.open_response)
         if self.spec.silicon_depth_um is None:
             return light
@@ -192,8 +181,6 @@ class Problem:
 
     def __call__(self, parameters: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """Cost and gradient with respect to parameters between 0 and 1: filters, depth of the silicon, tile shares."""
-        import drjit as dr
-
         types = jit()
         given = table(types.Float64, parameters)
         dr.enable_grad(given)
@@ -216,8 +203,6 @@ class Problem:
 
     def _steepness(self, transmittance: Float64) -> Float64:
         """Penalty of slopes above the largest one."""
-        import drjit as dr
-
         types = jit()
         place = dr.arange(types.UInt32, BANDS_NM.size - 1)
         step = float(BANDS_NM[1] - BANDS_NM[0]) * self.spec.slope_max_per_nm
@@ -255,10 +240,6 @@ def optimise(problem: Problem, progress: Callable[[float, float, str], None] | N
     ----------
     problem : the design.
     progress : called with (done, total, what).
-
-    Returns
-    -------
-    The best filters.
     """
     from scipy.optimize import minimize
 

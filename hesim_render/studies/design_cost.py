@@ -20,10 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float64
 from hesim_render.core.tables import table
 from hesim_render.sensor.photocurrent import photocurrent
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.specs.design import CostSpec
 from hesim_render.spectral.colorimetry import lab
 from hesim_render.spectral.spectrum import Spectrum, scale_to_lux
 from hesim_render.studies.colour_noise import GREY, ChannelNoise
@@ -31,15 +33,6 @@ from hesim_render.studies.colour_samples import colour_samples
 
 #: Noise in electrons² of the term of colour alone, which keeps its matrix defined.
 _LEAST_VARIANCE = 1e-3
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights of the parts of the cost: rms colour difference without noise and with it, event contrast."""
-
-    colour: float
-    noise: float
-    events: float
 
 
 def difference_weights(xyz: NDArray[np.float64], white_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -124,7 +117,7 @@ class DesignCost:
     events: Sequence[int]
     event_scale: tuple[float, float]
     event_window_us: float
-    weights: Weights
+    weights: CostSpec
 
     def __call__(self, responses: Sequence[Float64], counts: Sequence[Float64] | None = None) -> Float64:
         """The cost, a Dr.Jit number with derivatives.
@@ -134,8 +127,6 @@ class DesignCost:
         responses : response of each filter at the bands, Dr.Jit Float64 [band].
         counts : pixels of each channel of the frames in an output pixel, Dr.Jit numbers; None: those of `noise`.
         """
-        import drjit as dr
-
         if counts is None:
             counts = [dr.opaque(jit().Float64, float(count)) for count in self.noise.count]
         name = self.sensor.layout.filters[0]
@@ -154,8 +145,6 @@ class DesignCost:
         return total
 
     def _of_condition(self, condition: Condition, per_lux: list[Float64], counts: Sequence[Float64]) -> Float64:
-        import drjit as dr
-
         count = len(condition.xyz)
         index = dr.arange(jit().UInt32, count)
         chosen = [dr.gather(jit().Float64, per_lux[k], index) for k in self.frames]
@@ -175,8 +164,6 @@ class DesignCost:
 
     def _contrast(self, per_lux: list[Float64], grey: int, lux: float) -> Float64:
         """Relative rise of the light on the grey card that gives an event, the mean over event filters."""
-        import drjit as dr
-
         total: Float64 = jit().Float64(0.0)
         rise, baseline_e = self.event_scale
         for k in self.events:
@@ -188,8 +175,6 @@ class DesignCost:
 
     def _difference(self, condition: Condition, electrons: list[Float64], counts: Sequence[Float64] | None) -> Float64:
         """√J with its best matrix; without noise where there are no counts."""
-        import drjit as dr
-
         types, noise = jit(), self.noise
         if counts is not None:
             noise = replace(noise, count=np.array([float(each[0]) for each in counts]))
@@ -230,17 +215,13 @@ def best_matrix(
     xyz: NDArray[np.float64],
     weights: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """M with the least Σ |W (M c − x)|² + Σ_c Var(c_c) |W M_c|², by its normal equations.
+    """M with the least Σ |W (M c − x)|² + Σ_c Var(c_c) |W M_c|², by its normal equations, [3, channel].
 
     Parameters
     ----------
     electrons, variance : [surface, channel].
     xyz : [surface, 3].
     weights : [surface, 3, 3].
-
-    Returns
-    -------
-    [3, channel].
     """
     count = electrons.shape[1]
     # channels of one size, so that the equations are well conditioned

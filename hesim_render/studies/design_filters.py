@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float64
 from hesim_render.core.tables import table
 
@@ -29,27 +30,17 @@ class Family(Protocol):
 
     def bounds(self) -> list[tuple[float, float]]:
         """Least and largest value of each parameter of one filter."""
-        ...
 
     def transmittance(self, parameters: list[Float64]) -> Float64:
         """Transmittance at the wavelengths, 0 to 1, from Dr.Jit numbers."""
-        ...
 
     def start(self, wanted: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         """Parameters to start from: near a wanted transmittance, with some chance."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
 class Dyes:
-    """10^(−A) with A a sum of Gaussian bands, between a least and a largest transmittance.
-
-    Parameters
-    ----------
-    wavelength_nm : of the result.
-    bands : number of bands.
-    most, least : largest and least transmittance.
-    """
+    """10^(−A) with A a sum of Gaussian bands, between a least and a largest transmittance."""
 
     wavelength_nm: NDArray[np.float64]
     bands: int
@@ -62,8 +53,6 @@ class Dyes:
 
     def transmittance(self, parameters: list[Float64]) -> Float64:
         """See `Family.transmittance`."""
-        import drjit as dr
-
         grid = table(jit().Float64, self.wavelength_nm)
         absorbance = dr.zeros(jit().Float64, self.wavelength_nm.size)
         for k in range(self.bands):
@@ -112,8 +101,6 @@ class ThinFilms:
 
     def transmittance(self, parameters: list[Float64]) -> Float64:
         """See `Family.transmittance`."""
-        import drjit as dr
-
         grid = table(jit().Float64, self.wavelength_nm)
         # B = b_re + i b_im, C = c_re + i c_im, from the substrate to the light
         b_re, b_im, c_re, c_im = (
@@ -170,8 +157,6 @@ class FreeCurves:
 
     def transmittance(self, parameters: list[Float64]) -> Float64:
         """See `Family.transmittance`."""
-        import drjit as dr
-
         knots = self.knots_nm
         place = np.clip(np.searchsorted(knots, self.wavelength_nm, side="right") - 1, 0, knots.size - 2)
         share = (self.wavelength_nm - knots[place]) / (knots[place + 1] - knots[place])

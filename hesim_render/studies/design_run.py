@@ -68,10 +68,6 @@ def design(
     overwrite : replace the results of another design in `out`.
     progress : called with (done, total, what). None shows a bar in notebooks only, False never shows one.
 
-    Returns
-    -------
-    The filters, the table of the judgement, and verdicts.
-
     Raises
     ------
     SpecError

@@ -13,16 +13,12 @@ _REPULSION_PX = 1.2
 
 
 def counts_of(shares: NDArray[np.float64], pixels: int) -> NDArray[np.int64]:
-    """Whole pixels with nearly the given shares: largest remainders, and one of each at least.
+    """Whole pixels [filter] with nearly the given shares: largest remainders, and one of each at least.
 
     Parameters
     ----------
     shares : [filter], sum 1.
     pixels : number of pixels, at least that of filters.
-
-    Returns
-    -------
-    [filter], sum `pixels`.
     """
     is_free = np.ones(len(shares), dtype=bool)
     while True:  # who would get less than a pixel gets one, and the others share the rest

@@ -103,7 +103,7 @@ def mixing(sensor: Sensor, filters: Sequence[str], role: Role, crosstalk: float)
     """Share of each filter of the sensor in the electrons of the pixels behind some filters, in an even light.
 
     With crosstalk c a pixel keeps 1 − c of its own electrons and gets c/4 from each of its four neighbours. Shares are
-    averaged over the positions of the tile that have the filter and the role.
+    averaged over the positions of the tile that have the filter and the role: [filter, filter of the sensor].
 
     Parameters
     ----------
@@ -111,10 +111,6 @@ def mixing(sensor: Sensor, filters: Sequence[str], role: Role, crosstalk: float)
     filters : of the pixels.
     role : of the pixels.
     crosstalk : c.
-
-    Returns
-    -------
-    [filter, filter of the sensor].
     """
     spec = sensor.spec
     index = {name: k for k, name in enumerate(spec.filters)}

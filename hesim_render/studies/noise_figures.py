@@ -48,17 +48,13 @@ from hesim_render.studies.table import Cell
 
 
 def white_rate(responses: Sequence[Spectrum], light: Spectrum, lux: float = 1.0) -> NDArray[np.float64]:
-    """Electrons per second of one pixel of each channel on a perfect diffuser, ∫ R(λ) E(λ)/π dλ.
+    """Electrons per second of one pixel of each channel on a perfect diffuser, ∫ R(λ) E(λ)/π dλ, [channel].
 
     Parameters
     ----------
     responses : e⁻/s per W m⁻² sr⁻¹ nm⁻¹.
     light : relative spectral power.
     lux : illuminance of the diffuser, lx.
-
-    Returns
-    -------
-    [channel], e⁻/s.
 
     Raises
     ------

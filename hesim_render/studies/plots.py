@@ -22,16 +22,7 @@ PARETO = ("delta_e_mean_noise_aware", "ysnr_noise_aware")
 
 
 def pareto_front(cost: NDArray[np.float64], gain: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points no other point beats: none has at most the cost and at least the gain, and one of them better.
-
-    Parameters
-    ----------
-    cost, gain : [n].
-
-    Returns
-    -------
-    bool [n].
-    """
+    """Which points no other point beats: none has at most the cost and at least the gain, and one of them better."""
     better = (cost[None] <= cost[:, None]) & (gain[None] >= gain[:, None])
     strictly = (cost[None] < cost[:, None]) | (gain[None] > gain[:, None])
     return np.asarray(~(better & strictly).any(axis=1), dtype=np.bool_)

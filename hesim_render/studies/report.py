@@ -59,16 +59,12 @@ _MOST_GROUPS = 24
 
 
 def report_page(spec: StudySpec, result: StudyResult, summary: Markup | None = None) -> str:
-    """The page of a study.
+    """The page of a study, HTML.
 
     Parameters
     ----------
     spec, result : the study and its results.
     summary : HTML that comes first, after the description.
-
-    Returns
-    -------
-    HTML.
     """
     with report_style():
         responses = [*map(response_plot, _first_of_each_set(result.seen))]

@@ -73,28 +73,15 @@ class Table:
         return np.array(cells, dtype=object)
 
     def row(self, number: int) -> dict[str, Cell]:
-        """One row with all columns.
-
-        Parameters
-        ----------
-        number : from 0 on; negative ones count from the end.
-
-        Returns
-        -------
-        Cells by column.
-        """
+        """One row with all columns; negative numbers count from the end."""
         return {name: self._rows[number].get(name) for name in self._columns}
 
     def where(self, **cells: Cell) -> Table:
-        """The rows whose cells have given values.
+        """The rows whose cells have given values, as a new table.
 
         Parameters
         ----------
         cells : wanted value of each named column.
-
-        Returns
-        -------
-        A new table, perhaps without rows.
 
         Raises
         ------
@@ -117,24 +104,11 @@ class Table:
         return text.getvalue()
 
     def to_json(self, **more: Any) -> str:
-        """The table as JSON text: a list of rows under ``rows``; infinities become texts.
-
-        Parameters
-        ----------
-        more : further entries of the top level.
-
-        Returns
-        -------
-        The text.
-        """
+        """The table as JSON text: a list of rows under ``rows``, beside `more` entries; infinities become texts."""
         return json.dumps({**more, "columns": self._columns, "rows": [_plain(row) for row in self]}, indent=1) + "\n"
 
     def to_pandas(self) -> Any:
         """The table as a pandas data frame.
-
-        Returns
-        -------
-        ``pandas.DataFrame``.
 
         Raises
         ------
@@ -154,10 +128,6 @@ class Table:
         ----------
         path : ends in ``.csv``, ``.json`` or ``.parquet``.
         overwrite : replace a file that is there.
-
-        Returns
-        -------
-        The file.
 
         Raises
         ------

@@ -35,10 +35,6 @@ def open_cube(file: Path, wavelength_nm: Sequence[float] | None = None) -> CubeF
     file : ``.hdr`` (ENVI), ``.mat``, ``.h5``, ``.exr``, ``.npy``, or a folder of ``NAME_ms_01.png`` …
     wavelength_nm : of the bands, where the file does not say.
 
-    Returns
-    -------
-    The open cube, with wavelengths.
-
     Raises
     ------
     SpecError

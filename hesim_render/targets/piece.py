@@ -203,7 +203,8 @@ def bent(piece: TargetPiece, radius_m: float, step_m: float) -> TargetPiece:
     for triangle in corners:
         low, high = np.floor(triangle[:, 0].min() / step_m), np.ceil(triangle[:, 0].max() / step_m)
         for k in range(int(low), int(high)):
-            part = _cut(_cut(triangle, k * step_m, 1.0), (k + 1) * step_m, -1.0)
+            part = clipped(triangle, triangle[:, 0] - k * step_m)
+            part = clipped(part, (k + 1) * step_m - part[:, 0])
             parts += [part[[0, j, j + 1]] for j in range(1, len(part) - 1)]
     flat = np.concatenate(parts)
     vertices = on_cylinder(flat[:, :2], radius_m)
@@ -218,9 +219,8 @@ def on_cylinder(flat: NDArray[np.float64], radius_m: float) -> NDArray[np.float6
     return np.column_stack([radius_m * np.sin(angle), flat[:, 1], radius_m * (1 - np.cos(angle))])
 
 
-def _cut(polygon: NDArray[np.float64], x: float, sign: float) -> NDArray[np.float64]:
-    """The part of a convex polygon [k, n] whose first coordinate is above x (sign 1) or below (sign -1)."""
-    height = sign * (polygon[:, 0] - x)
+def clipped(polygon: NDArray[np.float64], height: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The part of a convex polygon [k, n] in which a linear function, `height` at its corners [k], is not negative."""
     kept: list[NDArray[np.float64]] = []
     for i in range(len(polygon)):
         j = (i + 1) % len(polygon)

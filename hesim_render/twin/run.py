@@ -62,10 +62,6 @@ def make_twin(
     overwrite : replace an existing twin.
     progress : called with a text that names the current work and the fraction done.
 
-    Returns
-    -------
-    The twin.
-
     Raises
     ------
     RangeError

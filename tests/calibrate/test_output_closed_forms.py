@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from hesim_render.calibrate.aps import light_curve, long_series, pair_levels, pairs_output
 from hesim_render.calibrate.aps import output as frames_output
-from hesim_render.calibrate.aps import pair_levels, pairs_output, pairs_required
 from hesim_render.calibrate.aps.common_mode import Shared
 from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal
@@ -352,16 +352,16 @@ def test_captures_are_refused_from_their_limits_on(part, is_refused):
     pairs = SimpleNamespace(dark=[ENTRY] * 2, spatial_dark=ENTRY, spatial_lit=ENTRY, lit=[ENTRY] * 5)
     long = SimpleNamespace(temporal=SimpleNamespace(pixel=0.3))
     dark = SimpleNamespace(low=np.array([0.0, 0.01 * part]))
-    act = partial(pairs_required.require_dark_noise, pairs, dark, long)
+    act = partial(long_series.require_dark_noise, pairs, dark, long)
     assert refused(act, "1.01 % of the dark pixels are 0 DN") is is_refused
     # saturated: as bright as the level of the largest variance, 19 DN², with less than half of it
     lit = SimpleNamespace(mean=np.array([60.0, 140.0, 190.0]), variance=np.array([6.0, 19.0, 3.0]))
     long = SimpleNamespace(mean=np.full((4, 6), 141.0), temporal=SimpleNamespace(pixel=9.5 / part))
-    act = partial(pairs_required.require_series_below_well, pairs, long, lit, 1)
+    act = partial(long_series.require_series_below_well, pairs, long, lit, 1)
     assert refused(act, "saturated, at 141 DN") is is_refused
     long = SimpleNamespace(mean=np.full((4, 6), 139.0 + part), temporal=SimpleNamespace(pixel=2.0))
-    assert refused(partial(pairs_required.require_series_below_well, pairs, long, lit, 1), "at 140 DN") is is_refused
-    pairs_required.require_series_below_well(pairs, long, lit, 3)  # no level is saturated
+    assert refused(partial(long_series.require_series_below_well, pairs, long, lit, 1), "at 140 DN") is is_refused
+    long_series.require_series_below_well(pairs, long, lit, 3)  # no level is saturated
     # two places of a tile that differ by 8 % of the mean of all four, 5 rows and 7 columns: the last count nowhere
     high = np.array([[100.0, 100.0], [100.0, 100 + 8.16 * part]])  # 8 % of 102.04
     signal = np.full((5, 7), 500.0)
@@ -377,6 +377,6 @@ def test_captures_are_refused_from_their_limits_on(part, is_refused):
     )  # the first has 2 % of the light at most, the last is not clear
     off[0] *= 0.99
     act = partial(
-        pairs_required.require_steady_light, pairs, curve, light, 2 * light * off, np.array([1, 1, 1, 1, 0], bool)
+        light_curve.require_steady_light, pairs, curve, light, 2 * light * off, np.array([1, 1, 1, 1, 0], bool)
     )
     assert refused(act, "this pair is 2 % off") is is_refused

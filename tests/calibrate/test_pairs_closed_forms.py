@@ -8,8 +8,8 @@ from scipy.stats import chi2 as chi2_law
 from scipy.stats import gamma
 
 from hesim_render.calibrate.aps import light_curve, noise_spectrum, spatial
+from hesim_render.calibrate.aps.light_curve import require_steady_light
 from hesim_render.calibrate.aps.pair_levels import Levels, pair_statistics
-from hesim_render.calibrate.aps.pairs_required import require_steady_light
 from hesim_render.core.errors import SpecError
 
 X = np.array([1.0, 2.5, 4.0, 7.0, 11.0])

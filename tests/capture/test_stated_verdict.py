@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from hesim_render.capture.error_meter import ErrorMeter, stated_verdict
-from hesim_render.capture.event_flux import EventFlux
+from hesim_render.capture.error_meter import ErrorMeter, EventFlux, stated_verdict
 from hesim_render.capture.lab_trials import TrialPlan
 from hesim_render.capture.scene_run import require_short
 from hesim_render.core.backend import jit

@@ -1,5 +1,7 @@
 """Ctrl-C: two seconds at most from anywhere in the command line, a KeyboardInterrupt in Python; nothing is left."""
 
+import builtins
+import math
 import os
 import random
 import signal
@@ -11,6 +13,7 @@ import pytest
 
 from hesim_render.cli.exit_status import ExitStatus, Interrupts
 from hesim_render.core.child import interrupts_held
+from hesim_render.core.device import dr
 
 #: A lock that is taken twice: native code that never comes back, and that no signal wakes.
 _NEVER = """
@@ -134,6 +137,25 @@ def test_an_interrupt_waits_while_native_libraries_are_loaded(python_handles_int
         loaded = True
     assert loaded
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_an_interrupt_waits_while_drjit_is_first_used(python_handles_interrupts, monkeypatch):
+    plain, loaded = builtins.__import__, []
+
+    def interrupted(name, *rest):
+        if name == "drjit":
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)
+            loaded.append(name)
+        return plain(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", interrupted)
+    fresh = type(dr)()
+    with pytest.raises(KeyboardInterrupt):
+        fresh.sum  # noqa: B018
+    assert loaded == ["drjit"]
+    monkeypatch.undo()
+    assert fresh.pi == math.pi and "pi" in vars(fresh)  # looked up once
 
 
 def test_handlers_are_put_back():

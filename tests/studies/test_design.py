@@ -13,7 +13,7 @@ import hesim_render as hr
 from hesim_render import cli
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
-from hesim_render.specs.design import DesignSpec
+from hesim_render.specs.design import CostSpec, DesignSpec
 from hesim_render.specs.files import list_names, read_spec
 from hesim_render.specs.filter_set import read_filter_set
 from hesim_render.specs.run import StudyKind, study_kind
@@ -24,7 +24,7 @@ from hesim_render.studies import ChannelNoise, Table, reflectance_set
 from hesim_render.studies.colour_samples import colour_samples
 from hesim_render.studies.design import BANDS_NM as DESIGN_NM
 from hesim_render.studies.design import Problem, optimise, silicon_depth
-from hesim_render.studies.design_cost import Condition, DesignCost, Weights, best_matrix, difference_weights
+from hesim_render.studies.design_cost import Condition, DesignCost, best_matrix, difference_weights
 from hesim_render.studies.design_filters import Dyes, FreeCurves, ThinFilms
 from hesim_render.studies.design_run import CHART_PX, _judgement, _verdicts, design, designed_set
 from hesim_render.studies.design_tile import counts_of, spread_tile
@@ -117,7 +117,7 @@ def cost_of(weights, events=True):
     noise = ChannelNoise(np.array([30.0, 25.0, 30.0]), np.ones(3), np.array([1e-5] * 3), np.array([1.0, 2.0, 1.0]))
     return DesignCost(
         sensor, BANDS, conditions, (20.0, 1000.0), 10_000.0, noise, (0, 1, 2), (1,) if events else (),
-        (0.22, 12.0), 1000.0, weights,
+        (0.22, 12.0), 1000.0, CostSpec(**dict(zip(("colour", "noise", "events"), weights, strict=True))),
     )  # fmt: skip
 
 
@@ -125,7 +125,7 @@ def test_the_cost_is_that_of_its_formula():
     """All written out again in NumPy, with the matrix of a least-squares solver."""
     rng = np.random.default_rng(5)
     curves = np.exp(-(((BANDS - np.array([[600], [540], [460]])) / 50) ** 2)) * 1e7 * rng.uniform(0.8, 1.2, (3, 1))
-    for weights in (Weights(1, 0, 0), Weights(0, 1, 0), Weights(0, 0, 1), Weights(0.3, 0.5, 0.2)):
+    for weights in ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0.3, 0.5, 0.2)):
         cost = cost_of(weights)
         found = float(cost([jit().Float64(curve) for curve in curves])[0])
         assert found == pytest.approx(reference(cost, curves), rel=2e-4)
@@ -171,7 +171,7 @@ def reference(cost, curves, bands=BANDS):
 @pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES)
 def test_gradients_of_the_cost_are_central_differences(family):
     """Through filters, Eq. 1 and the best matrix: 1e-3 of the gradient's norm, on a float64 copy of everything."""
-    cost = cost_of(Weights(0.3, 0.5, 0.2))
+    cost = cost_of((0.3, 0.5, 0.2))
     values = [drawn(family, seed) for seed in (11, 12, 13)]
     scale = 1e7 * np.exp(-(((BANDS - 560) / 140) ** 2))
 

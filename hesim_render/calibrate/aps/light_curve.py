@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_law
 from scipy.stats import f as f_law
 
+from hesim_render.calibrate.aps.pair_levels import MOST_CHANGE
 from hesim_render.calibrate.estimate import ALARM
+from hesim_render.recording.pair_set import PairSet
 
 #: Gauss–Newton steps of a fit that is nearly linear.
 _STEPS = 4
@@ -238,3 +240,17 @@ def _fit(h: NDArray, y: NDArray, weight: NDArray, free: NDArray) -> tuple[NDArra
     for _ in range(_STEPS):
         p[free] += np.linalg.lstsq((_gradient(p, h)[free] * weight).T, weight * (y - _value(p, h)), rcond=None)[0]
     return p, float(np.sum((weight * (y - _value(p, h))) ** 2))
+
+
+def require_steady_light(
+    pairs: PairSet, curve: MeanCurve, light: NDArray, signal: NDArray, clear: NDArray[np.bool_]
+) -> None:
+    """Refuse a level that lies far from the curve of all others: its light was another."""
+    expected = curve.at(light)
+    deviation = np.where(clear, np.abs(signal / expected - 1), 0.0)
+    deviation[signal < 0.02 * signal.max()] = 0.0  # offsets and dark drift weigh more than light there
+    k = int(np.argmax(deviation))
+    if deviation[k] > MOST_CHANGE:
+        raise pairs.lit[k].error(
+            f"the light drifts between exposures: this pair is {100 * deviation[k]:.2g} % off the curve of all others"
+        )

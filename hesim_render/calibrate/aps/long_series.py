@@ -8,13 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum, noise_spectrum
-from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, SpatialStack
+from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, Levels, SpatialStack
 from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal, spatial_variance, temporal_of
 from hesim_render.calibrate.moments import FrameMoments, Progress, measure
 from hesim_render.recording.pair_set import PairSet
 
 #: Part of the pixels at full scale in the dark that are taken for defects; more are a dark series that is lit.
 _MOST_STUCK = 0.01
+#: Part of the largest temporal variance below which a brighter series is at the full well.
+_WELL_PART = 0.5
 
 
 @dataclass(frozen=True)
@@ -87,3 +89,25 @@ def long_of(moments: FrameMoments, spectrum: NoiseSpectrum | None) -> Long:
     temporal, levels = temporal_of(moments)
     spatial = spatial_variance(mean, temporal, moments.frames, moments.variance[0])
     return Long(mean, moments.variance[0], moments.first[0], moments.frames, levels, temporal, spatial, spectrum)
+
+
+def require_dark_noise(pairs: PairSet, dark: Levels, long_dark: Long) -> None:
+    """Refuse dark frames that are clipped at 0, or whose series does not differ from frame to frame."""
+    for k, entry in enumerate(pairs.dark):
+        if dark.low[k] > 0.01:
+            raise entry.error(
+                f"{100 * dark.low[k]:.3g} % of the dark pixels are 0 DN, which hides a part of the noise; raise the "
+                "black level (offset)"
+            )
+    if long_dark.temporal.pixel <= 0:
+        raise pairs.spatial_dark.error("the frames do not differ")
+
+
+def require_series_below_well(pairs: PairSet, long_lit: Long, lit: Levels, saturation: int) -> None:
+    """Refuse a long series at the full well, where the light makes no noise any more and no spread over pixels."""
+    if saturation >= lit.mean.size:
+        return
+    if long_lit.mean.mean() >= lit.mean[saturation] and long_lit.temporal.pixel < _WELL_PART * lit.variance[saturation]:
+        raise pairs.spatial_lit.error(
+            f"the long series is saturated, at {long_lit.mean.mean():.0f} DN; EMVA 1288 takes it at 50 % of saturation"
+        )

@@ -20,17 +20,19 @@ from hesim_render.calibrate.aps.light_curve import (
     MeanCurve,
     linearity_error,
     mean_curve,
+    require_steady_light,
     straight,
     through_origin,
 )
-from hesim_render.calibrate.aps.long_series import Long, long_series, stuck_pixels
-from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
-from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, Levels, both_levels, require_one_colour
-from hesim_render.calibrate.aps.pairs_required import (
+from hesim_render.calibrate.aps.long_series import (
+    Long,
+    long_series,
     require_dark_noise,
     require_series_below_well,
-    require_steady_light,
+    stuck_pixels,
 )
+from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
+from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, Levels, both_levels, require_one_colour
 from hesim_render.calibrate.aps.rounded_noise import RoundedNoise, rounded_noise
 from hesim_render.calibrate.aps.spatial import Pattern, outliers, pattern_of
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance

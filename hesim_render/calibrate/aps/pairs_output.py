@@ -44,10 +44,6 @@ def calibrate_pairs(
     progress : called with a text that names the current work and the fraction done.
     overwrite : replace a report of another calibration.
 
-    Returns
-    -------
-    The result of the captures.
-
     Raises
     ------
     SpecError

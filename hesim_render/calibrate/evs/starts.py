@@ -51,10 +51,6 @@ def multi_start(pixels: PixelCounts, fit: EventFit, theta_v: float, seed: int) -
     fit : the fit whose parameters the starts surround.
     theta_v : Θ, threshold in V.
     seed : seed of the starts.
-
-    Returns
-    -------
-    The ends of the searches.
     """
     rng = np.random.default_rng(seed)
     begin = np.tile(fit.values, (_STARTS, 1))

@@ -125,25 +125,17 @@ def light_gain_dn(beta: Sequence[Values] | NDArray, signal_dn: Values, exposure_
     beta : β0 … β5 on the first axis, in DN and s.
     signal_dn : light signal I, DN.
     exposure_s : exposure t, s.
-
-    Returns
-    -------
-    g, DN.
     """
     return beta[1] + beta[3] * signal_dn + beta[4] * exposure_s
 
 
 def dark_variance_dn2(beta: Sequence[Values] | NDArray, exposure_s: Values) -> Values:
-    """Variance without light, β0 + β2 t + β5 t².
+    """Variance without light, β0 + β2 t + β5 t², DN².
 
     Parameters
     ----------
     beta : β0 … β5 on the first axis, in DN and s.
     exposure_s : exposure t, s.
-
-    Returns
-    -------
-    Variance, DN².
     """
     return beta[0] + (beta[2] * exposure_s + beta[5] * exposure_s * exposure_s)
 
@@ -156,10 +148,6 @@ def polynomial(beta: ArrayLike, signal_dn: Values, exposure_s: Values) -> NDArra
     beta : [..., 6], in DN and s.
     signal_dn : light signal I, DN; it must broadcast against `beta` without its last axis.
     exposure_s : exposure t, s; it must broadcast likewise.
-
-    Returns
-    -------
-    Variance, DN².
     """
     b = np.moveaxis(np.asarray(beta), -1, 0)
     return dark_variance_dn2(b, exposure_s) + signal_dn * light_gain_dn(b, signal_dn, exposure_s)
@@ -200,10 +188,6 @@ def physical_value(
     system_gain_dn_per_e : K, DN/e⁻.
     read_noise_e : σ_r, e⁻.
     shot : whether the light has shot noise. Without it, the shot noise of the dark current remains.
-
-    Returns
-    -------
-    Law of the value.
     """
     light, dark = pixels.response * electrons, pixels.dark_e_per_s * exposure_s
     read_dn2 = (system_gain_dn_per_e * read_noise_e) ** 2
@@ -235,10 +219,6 @@ def calibrated_value(
     full_scale_dn : largest value of the ADC, DN.
     xp : functions of the arrays' library.
     curve : non-linearity of the signal. The polynomial is one in the signal that comes out of it.
-
-    Returns
-    -------
-    Law of the value.
     """
     assert pixels.beta is not None
     signal = system_gain_dn_per_e * (pixels.response * electrons)
@@ -263,10 +243,6 @@ def bent_value(value: PixelValue, system_gain_dn_per_e: float, curve: Curve, xp:
     system_gain_dn_per_e : K, DN/e⁻.
     curve : the non-linearity.
     xp : functions of the arrays' library.
-
-    Returns
-    -------
-    Law of the value.
     """
     whole = value.fixed_dn + system_gain_dn_per_e * value.count
     factor, slope = curve.factor(whole, xp), curve.slope(whole, xp)
@@ -305,10 +281,6 @@ def fourth_cumulant_dn4(gain_dn: Values, count_variance_dn2: Values) -> Values:
     ----------
     gain_dn : g, DN.
     count_variance_dn2 : g² m, DN².
-
-    Returns
-    -------
-    κ₄, DN⁴.
     """
     return gain_dn * gain_dn * count_variance_dn2
 
@@ -320,10 +292,6 @@ def telegraph_levels(amplitude: Values, high_share: Values) -> tuple[Values, Val
     ----------
     amplitude : a, high level minus low level, in any unit.
     high_share : p, fraction of the time at the high level.
-
-    Returns
-    -------
-    low, high : levels in the unit of the amplitude.
     """
     return -amplitude * high_share, amplitude * (1.0 - high_share)
 

@@ -171,7 +171,7 @@ class ApsNoise(PlainState):
         return ""
 
     def value(self, electrons: Values, exposure_s: Values, pixels: PixelProperties, xp: Namespace) -> PixelValue:
-        """Law of the pixels' values, without N_FP and row noise.
+        """Law of the pixels' values, DN, without N_FP and row noise.
 
         Parameters
         ----------
@@ -179,10 +179,6 @@ class ApsNoise(PlainState):
         exposure_s : exposure, s.
         pixels : properties of the pixels.
         xp : functions of the arrays' library.
-
-        Returns
-        -------
-        Law of the values, DN.
         """
         gain, full_scale = self.spec.system_gain_dn_per_e, float(self.full_scale_dn)
         curve = formulas.Curve.of(self.spec.nonlinearity, full_scale)

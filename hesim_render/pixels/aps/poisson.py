@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Float64, Generator, Mask, UInt32
 
 #: Transformed rejection is used from this mean on. Its hat function is valid for means of 10 and more.
@@ -31,8 +32,6 @@ def poisson(mean: Float, generator: Generator, words: tuple[UInt32, UInt32] | No
     -------
     Float, whole numbers (exact below 2²⁴).
     """
-    import drjit as dr
-
     if words is None:
         drawn = generator.next_uint32x4()
         words = drawn[0], drawn[1]
@@ -49,13 +48,7 @@ def _search(mean: Float, high: UInt32, low: UInt32) -> Float:
     ----------
     mean : expected count.
     high, low : words of u, a 64-bit fraction.
-
-    Returns
-    -------
-    Float, whole numbers.
     """
-    import drjit as dr
-
     types = jit()
     wide = types.Float64(mean)
     uniform = dr.fma(types.Float64(low), 2.0**-64, types.Float64(high) * 2.0**-32)
@@ -76,8 +69,6 @@ def _search(mean: Float, high: UInt32, low: UInt32) -> Float:
 
 def _transformed_rejection(mean: Float, generator: Generator, u_word: UInt32, v_word: UInt32) -> Float:
     """Hörmann's PTRS for means of 10 and more; 0 elsewhere."""
-    import drjit as dr
-
     types = jit()
     needed = mean >= _REJECTION_FROM
     mean = dr.maximum(mean, _REJECTION_FROM)
@@ -104,8 +95,6 @@ def _transformed_rejection(mean: Float, generator: Generator, u_word: UInt32, v_
 
 def _propose(mean: Float, u_word: UInt32, v_word: UInt32) -> tuple[Float, Mask]:
     """One proposal of PTRS: a count, and whether it is accepted."""
-    import drjit as dr
-
     types = jit()
     b = dr.fma(dr.sqrt(mean), 2.53, 0.931)
     a = dr.fma(b, 0.02483, -0.059)
@@ -129,8 +118,6 @@ def _propose(mean: Float, u_word: UInt32, v_word: UInt32) -> tuple[Float, Mask]:
 
 def _log_probability(count: Float, mean: Float) -> tuple[Float, Float]:
     """Poisson probability as exp(−deviance)/scale [loader2000]: bd0 plus the Stirling error, and √(2πk)."""
-    import drjit as dr
-
     empty = count == 0.0
     k = dr.maximum(count, 1.0)
     inverse_square = 1.0 / (k * k)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Generator, UInt32, device_namespace
 from hesim_render.core.rng import Stream, normal_pair, philox
 from hesim_render.core.units import S_PER_US
@@ -47,8 +48,6 @@ class DeviceMaps:
 
     def pixels(self, index: UInt32) -> PixelProperties:
         """Properties of the pixels `index` of the region. As many indices as pixels means all pixels in their order."""
-        import drjit as dr
-
         if dr.width(index) == self._layout.rows * self._layout.cols:
             return self._pixels
 
@@ -65,8 +64,6 @@ class DeviceMaps:
 
     def keys(self, index: UInt32) -> UInt32:
         """Full-sensor index of pixels of the region. A region as wide as the sensor needs no table."""
-        import drjit as dr
-
         types, sensor_cols = jit(), self._layout.spec.geometry.cols
         if self._layout.cols == sensor_cols:
             return index + dr.opaque(types.UInt32, self._layout.row0 * sensor_cols)
@@ -76,7 +73,7 @@ class DeviceMaps:
 def draw_dn(
     noise: ApsNoise, maps: DeviceMaps, electrons: Float, exposure_us: float, seed: int, frame: int, first_pixel: int
 ) -> UInt32:
-    """Values of the pixels of a frame from `first_pixel` on; see `ApsNoise.sample_dn`.
+    """Values of the pixels of a frame from `first_pixel` on, UInt32 [n], DN; see `ApsNoise.sample_dn`.
 
     Parameters
     ----------
@@ -86,13 +83,7 @@ def draw_dn(
     exposure_us : exposure, µs.
     seed, frame : seed of the noise and number of the frame.
     first_pixel : index of the first pixel in the region, row-major.
-
-    Returns
-    -------
-    UInt32 [n], DN.
     """
-    import drjit as dr
-
     types, spec = jit(), noise.spec
     index = dr.arange(types.UInt32, dr.width(electrons)) + dr.opaque(types.UInt32, first_pixel)
     pixels = maps.pixels(index)
@@ -138,8 +129,6 @@ def draw_dn(
 
 def _sine(cols: int, line: InterferenceSpec, key: UInt32, generator: Generator) -> Float:
     """Value of an interference at pixels of the full sensor, DN; its phase is the generator's next number."""
-    import drjit as dr
-
     types = jit()
     word = generator.next_uint32x4()[0]
     width = dr.opaque(types.UInt32, cols)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.rng import Stream, device_uniform
 from hesim_render.core.units import US_PER_S
@@ -56,20 +57,14 @@ class TelegraphPixels:
         return np.where(high, *formulas.telegraph_levels(self.amplitude_dn, self.high_share)[::-1])
 
     def added_dn(self, seed: int, frame: int, pixels: int, index: UInt32) -> Float:
-        """Deviations from the mean in a frame on the device; 0 at pixels without telegraph noise.
+        """Deviations from the mean in a frame on the device, DN; 0 at pixels without telegraph noise.
 
         Parameters
         ----------
         seed, frame : seed of the noise and number of the frame.
         pixels : number of pixels of the region.
         index : pixels that are asked for.
-
-        Returns
-        -------
-        Float, DN, one value per entry of `index`.
         """
-        import drjit as dr
-
         types = jit()
         every = dr.zeros(types.Float, pixels)
         values = types.Float(self.values_dn(seed, frame).astype(np.float32))

@@ -108,12 +108,7 @@ class EventLabels:
 
     @classmethod
     def of(cls, blocks: Sequence[LabelBlock]) -> EventLabels:
-        """The labels of a whole run from all its blocks.
-
-        Parameters
-        ----------
-        blocks : in order of time.
-        """
+        """The labels of a whole run from all its blocks, which are in order of time."""
         every = [LabelBlock.empty(), *blocks]
         label = np.concatenate([block.label for block in every])
         for block in every:

@@ -109,10 +109,6 @@ def log_level(k: Coefficients, signal: Values, law: ShotLaw, xp: Namespace) -> t
     signal : I, in the unit of the coefficients.
     law : shot law.
     xp : functions of the arrays' library.
-
-    Returns
-    -------
-    ln x, s²/x².
     """
     x = voltage(k, signal)
     return xp.log(x), voltage_variance(k, shot_root(signal, law, xp), xp) / (x * x)
@@ -131,10 +127,6 @@ def noise_equivalent(
     law : shot law.
     xp : functions of the arrays' library.
     share : part of the variance s² that the photoreceptor leaves.
-
-    Returns
-    -------
-    Change, in the unit of the signal.
     """
     noise = xp.sqrt(voltage_variance(k, shot_root(signal, law, xp), xp) * share)
     return xp.maximum(noise, least_change * voltage(k, signal)) / k.slope
@@ -178,10 +170,6 @@ def corner_hz(
     xp : functions of the arrays' library.
     series_hz : corner of the bias current, in series with that of the light, whose line goes on beyond `largest_hz`;
         None: the line ends there.
-
-    Returns
-    -------
-    Corner frequency, Hz.
     """
     line = corner_line((xp.exp(log) - k.base) / reference_level, least_hz, largest_hz)
     if series_hz is not None:
@@ -206,10 +194,6 @@ def event_probabilities(
     theta_on, theta_off : thresholds, ln units, positive.
     change : S = ln x₁/x₀.
     sigma : σ_n. Thresholds with the relative spread m are included as noise: √(σ_n² + m² θ²).
-
-    Returns
-    -------
-    P₊, P₋.
     """
     return exceedance(np.asarray(theta_on) - change, sigma), exceedance(np.asarray(theta_off) + change, sigma)
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
 from hesim_render.core.rng import Stream
 from hesim_render.core.tables import spread_out
@@ -83,8 +84,6 @@ class LastEvent:
         self.reference = reference if self._drift is None else reference + self._drift.way
 
     def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
-        import drjit as dr
-
         log, variance = self._noise.log_level(electrons)
         spread = dr.sqrt(variance)
         dr.eval(log, spread)
@@ -95,8 +94,6 @@ class LastEvent:
 
     def _start(self, electrons: Float, log: Float, spread: Float, t_us: int) -> None:
         """Begin in still light: where noise makes events, as pixels are after a long time in it, or all at a reset."""
-        import drjit as dr
-
         # without noise, or after a reset, all pixels begin with the level of the first sample
         settles = self._band_noise is not None and not self._is_reset
         self._t_us = t_us - self._band_noise.periods_us(_SETTLING_PERIODS) if settles and self._band_noise else t_us
@@ -128,8 +125,6 @@ class LastEvent:
 
     def _go_on(self, electrons: Float, log: Float, spread: Float, t_us: int) -> NDArray[np.void]:
         """Events up to the sample at `t_us`."""
-        import drjit as dr
-
         parts: list[NDArray[np.void]] = []
         begin_us = float(self._t_us)
         low_pass = self._photoreceptor
@@ -183,8 +178,6 @@ class LastEvent:
 
     def _crossings(self, level: Float, begin_us: float, end_us: float) -> NDArray[np.void]:
         """Events of one segment in which the level goes on a straight line to `level`, unsorted."""
-        import drjit as dr
-
         if self._refractory:
             return self._crossings_with_dead_time(self._refractory, level, begin_us, end_us)
         types = jit()
@@ -252,8 +245,6 @@ class LastEvent:
         level : level of each pixel at the end.
         nodes_us : times of the begin, of the nodes and of the end, µs.
         """
-        import drjit as dr
-
         types, times_us = jit(), np.array(nodes_us)
         due, end = self._due(nodes_us[0], nodes_us[-1]), low_pass.now
         # noise and drift go on a line
@@ -295,8 +286,6 @@ class LastEvent:
         self, pixel: NDArray[np.uint32], paths: NDArray[np.float32], times_us: NDArray[np.float64], due: DueEvents
     ) -> NDArray[np.void]:
         """Events of some pixels, whose references go on with them; see `events_on_paths`."""
-        import drjit as dr
-
         types = jit()
         index = types.UInt32(pixel)
         own = np.array(take(self.reference, index)).astype(np.float64)
@@ -332,8 +321,6 @@ class LastEvent:
 
 def _columns(values: Float, chosen: NDArray[np.uint32], columns: int, rows: int) -> Float:
     """Some columns of a table that is stored row by row."""
-    import drjit as dr
-
     types = jit()
     entry, width = dr.arange(types.UInt32, rows * chosen.size), dr.opaque(types.UInt32, chosen.size)
     row = entry // width

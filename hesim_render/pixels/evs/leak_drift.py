@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Float64
 from hesim_render.core.rng import Stream, device_normal, device_uniform
 from hesim_render.core.units import US_PER_S
@@ -31,12 +32,7 @@ _FAR = 4.0
 
 
 class LeakDrift:
-    """Way of each pixel's drift, and what it says about the origin of events.
-
-    Parameters
-    ----------
-    noise : with a leak of the process 'drift'.
-    """
+    """Way of each pixel's drift (a leak of the process 'drift'), and what it says about the origin of events."""
 
     STATE = ("_way", "_per_us", "_at_event")
 
@@ -65,8 +61,6 @@ class LeakDrift:
         self._at_event: NDArray[np.float64] = np.zeros(size)  # way at the last event of each pixel
 
     def _speed(self, electrons: Float) -> Float64:
-        import drjit as dr
-
         return dr.fma(self._light, dr.maximum(jit().Float64(electrons), 0.0), self._dark)
 
     def start(self, electrons: Float, is_reset: bool, events_hz: NDArray[np.float64], chance: NDArray) -> None:
@@ -79,8 +73,6 @@ class LeakDrift:
         events_hz : noise events of each pixel, Hz, which end a drift before its own event.
         chance : [pixel], a uniform random number of each pixel.
         """
-        import drjit as dr
-
         self._per_us = self._speed(electrons) + dr.zeros(jit().Float64, self._theta_on.size)
         way = np.zeros(self._theta_on.size)
         if not is_reset:
@@ -109,8 +101,6 @@ class LeakDrift:
         electrons : of the window of the next sample.
         part, elapsed_us : time after the last sample, over that of the next one, and in µs.
         """
-        import drjit as dr
-
         types = jit()
         mean = dr.fma(self._speed(electrons) - self._per_us, dr.opaque(types.Float64, 0.5 * part), self._per_us)
         return types.Float(dr.fma(mean, dr.opaque(types.Float64, elapsed_us), self._way))
@@ -129,8 +119,6 @@ class LeakDrift:
         -------
         [pixel], by how much levels and references are to be lowered: 0 but for pixels that have drifted far.
         """
-        import drjit as dr
-
         types = jit()
         length_us = float(end_us - begin_us)
         later = self._speed(electrons) + dr.zeros(types.Float64, self._theta_on.size)

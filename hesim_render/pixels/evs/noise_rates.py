@@ -112,7 +112,7 @@ def noise_rates_hz(
     dead_s: float,
     leak_hz: float = 0.0,
 ) -> tuple[float, float]:
-    """Rates of ON and of OFF noise events of a pixel, mean over pixels, in steady light.
+    """Rates of ON and of OFF noise events of a pixel, mean over pixels, in steady light, Hz.
 
     In the long run both directions travel equally far: the rates are inverse to the thresholds, each with the distance
     that the level goes beyond it during the dead time.
@@ -125,10 +125,6 @@ def noise_rates_hz(
     bandwidth_hz : −3 dB frequency of the noise, Hz.
     dead_s : dead time after an event, s; 0 for none.
     leak_hz : rate of leak events, Hz, which are no part of the result.
-
-    Returns
-    -------
-    ON, OFF, in Hz.
     """
     if sigma <= 0:
         return 0.0, 0.0

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32, device_namespace
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.arrays import take, to_device
@@ -85,8 +86,6 @@ class EventPixels:
     @property
     def log_of_largest_corner(self) -> Float:
         """ln x from which on a photoreceptor's corner is its largest."""
-        import drjit as dr
-
         return dr.log(self._reference_level + self._coefficients.base)
 
 
@@ -95,8 +94,6 @@ def _by_position(layout: Layout) -> Callable[[NDArray[np.float64]], Float]:
 
     The function gives an opaque number where all positions agree, and a look-up table by position otherwise.
     """
-    import drjit as dr
-
     position: UInt32 = None
 
     def spread(values: NDArray[np.float64]) -> Float:

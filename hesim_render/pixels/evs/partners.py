@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
 from hesim_render.pixels.evs.balance import CAUSE, EFFECT, Balance, LastSteps, PixelSteps
 from hesim_render.pixels.evs.events import Label, Origin
@@ -232,8 +233,6 @@ class Partners:
 
 def _take_over(pixels: EvsStage, reference: Float, which: NDArray[np.int64]) -> NDArray[np.float32]:
     """Let some pixels compare with other levels. Returns how far their references have moved, ln x."""
-    import drjit as dr
-
     if which.size == 0:
         return np.empty(0, np.float32)
     types = jit()
@@ -248,12 +247,7 @@ def _take_over(pixels: EvsStage, reference: Float, which: NDArray[np.int64]) -> 
 
 
 class _WithDeadTime:
-    """Noise-free pixels with the dead time of the real ones.
-
-    Parameters
-    ----------
-    own, nominal, seed : of `Partners`.
-    """
+    """Noise-free pixels with the dead time of the real ones; parameters as for `Partners`."""
 
     def __init__(self, own: EvsNoise, nominal: EvsNoise | None, seed: int) -> None:
         self._cols = own.layout.evs_shape[1]

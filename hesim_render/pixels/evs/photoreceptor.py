@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.tables import table
 from hesim_render.core.units import US_PER_S
@@ -105,8 +106,6 @@ class Photoreceptor:
         log : ln x of each pixel.
         t_us : time of the sample, µs.
         """
-        import drjit as dr
-
         self._t_us, self._node = float(t_us), self._node_at(t_us)
         settled = dr.zeros(jit().Float, dr.width(log))
         self._input, self._state = log, (settled, settled)
@@ -129,8 +128,6 @@ class Photoreceptor:
         -------
         True if the filter is at `t_us` now, where y is `log`; False if it is where it was.
         """
-        import drjit as dr
-
         z, y = self._state
         # the light is that of before, and z and y are too small to matter
         still = (log == self._input) & (z * z + y * y < _SETTLED**2)
@@ -141,8 +138,6 @@ class Photoreceptor:
 
     def to(self, log: Float, t_us: float) -> Float:
         """y at `t_us`, µs, if ln x goes on a straight line to `log`."""
-        import drjit as dr
-
         elapsed = dr.opaque(jit().Float, t_us - self._t_us)
         self._state = self._stepped(self._state, self._input, log - self._input, elapsed, self._noise.on_device)
         self._input, self._t_us, self._node = log, t_us, self._node_at(t_us)
@@ -172,8 +167,6 @@ class Photoreceptor:
         levels : [nodes · n], the pixels of a node side by side.
         least, most : of the levels of each pixel, [n].
         """
-        import drjit as dr
-
         types, pixels, count = jit(), self._noise.on_device.at(pixel), len(times_us)
         before, after, z, y = (take(values, pixel) for values in (begin.log, log, begin.z, begin.y))
         since_us = times_us - begin.t_us
@@ -221,8 +214,6 @@ class Photoreceptor:
         elapsed_us : time of the line, µs.
         pixels : parameters of the pixels.
         """
-        import drjit as dr
-
         types = jit()
         # opaque, so that no corner is written into the kernel
         largest = dr.opaque(types.Float, _rate(self._spec.cutoff_hz))
@@ -245,8 +236,6 @@ class Photoreceptor:
         """State at the end of a line on which the corner is below its largest value, in as many steps as the
         quadrature needs.
         """
-        import drjit as dr
-
         types = jit()
         # in still light the corner is constant, and one step is exact whatever its length
         brightest: Float = dr.maximum(begin, begin + change)
@@ -265,8 +254,6 @@ class Photoreceptor:
 
     def _quadrature(self, state: _State, begin: Float, change: Float, elapsed_us: Float, pixels: EventPixels) -> _State:
         """State at the end of a short line on which the corner follows the light, by Gauss and Legendre."""
-        import drjit as dr
-
         # corner times elapsed time at the three points of the quadrature
         rates = [self._rate_at(dr.fma(change, place, begin), pixels) * elapsed_us for place in _PLACES]
         total = sum(weight * rate for weight, rate in zip(_WEIGHTS, rates, strict=True))
@@ -292,16 +279,12 @@ class Photoreceptor:
 
 def _advance(state: _State, change: Float, h: Float) -> _State:
     """State at the end of a line of constant corner; `h` is H."""
-    import drjit as dr
-
     lag = dr.select(h < _SHORT_H, _short_lag(h), (1.0 - dr.exp(-h)) / h)  # p
     return _decayed(state, h, (lag * change, (2.0 * lag - dr.exp(-h)) * change))
 
 
 def _decayed(state: _State, h: Float, shift: _State) -> _State:
     """State after its decay over H and a shift down."""
-    import drjit as dr
-
     z, y = state[0], dr.fma(h, *state)
     # next to 1, E would lose the digits of 1 − E
     left, loss, is_short = dr.exp(-h), h * _short_lag(h), h < _SHORT_H
@@ -311,8 +294,6 @@ def _decayed(state: _State, h: Float, shift: _State) -> _State:
 
 def _short_lag(h: Float) -> Float:
     """p = (1 − exp(−h))/h by its series, good to 1e-8 up to `_SHORT_H`."""
-    import drjit as dr
-
     series = dr.fma(h, 1 / 5040, -1 / 720)
     for term in (1 / 120, -1 / 24, 1 / 6, -1 / 2, 1.0):
         series = dr.fma(h, series, term)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
 from hesim_render.core.rng import Stream, normal_pair, philox
 from hesim_render.core.units import S_PER_US
@@ -31,8 +32,6 @@ class PreviousSample:
         self._variance: Float = None  # s²/x² of the last sample, where noise is independent
 
     def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
-        import drjit as dr
-
         types = jit()
         level, variance = self._noise.log_level(electrons)
         if self._photoreceptor:
@@ -75,8 +74,6 @@ class PreviousSample:
         return events_at(t_us, pixel, result[pixel], self._cols)
 
     def _keep(self, level: Float, variance: Float, t_us: int) -> None:
-        import drjit as dr
-
         self._t_us, self._level = t_us, level
         if self._independent:
             self._variance = variance

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Float64, UInt32
 from hesim_render.core.rng import Stream, normal_pair, philox, stream_key
 from hesim_render.core.units import US_PER_S
@@ -77,8 +78,6 @@ class BandNoise:
 
     def _advance(self) -> None:
         """Step the state by one node."""
-        import drjit as dr
-
         self._value, speed = self._state
         z = self._deviates(self._node + 1)
         if not self._is_alike:
@@ -93,8 +92,6 @@ class BandNoise:
 
     def start(self, t_us: int) -> Float:
         """Begin in the stationary state. Returns the noise at `t_us`, µs."""
-        import drjit as dr
-
         self._node = math.floor(t_us / self._period_us)
         self._state = tuple(self._amplitude * z for z in self._deviates(self._node))
         self._advance()
@@ -123,8 +120,6 @@ class BandNoise:
 
     def at(self, t_us: float) -> Float:
         """The noise at `t_us`, which lies at most one node ahead of the present."""
-        import drjit as dr
-
         # how far the time is on the way to the next node
         part = t_us / self._period_us - self._node
         if part > 1.0 - 1e-9:  # the next node is reached, but for rounding
@@ -137,8 +132,6 @@ class BandNoise:
 
     def _angle(self) -> Float:
         """h = a·period of each pixel."""
-        import drjit as dr
-
         if self._own is not None:
             return self._own
         assert self._photoreceptor is not None
@@ -146,8 +139,6 @@ class BandNoise:
 
     def _scale(self) -> Float:
         """Amplitude that compensates the interpolation, for each pixel's own rate."""
-        import drjit as dr
-
         h = self._angle()
         return dr.sqrt(3.0 / dr.fma(1.0 + h, dr.exp(-h), 2.0))
 
@@ -163,8 +154,6 @@ def _step(value: Float, speed: Float, h: Float, z: tuple[Float, Float]) -> tuple
     With E = exp(−h) and x = 2h, what the step adds has Var u = 1 − E²(1 + x + x²/2) = ½ x³ Σ (−x)^k / (k! (k + 3)),
     covariance E² x²/2, and Var u'/a = 1 − E²(1 − x + x²/2).
     """
-    import drjit as dr
-
     decay = dr.exp(-h)
     # Horner's scheme of the series of Var u, from its last term
     x, squared = 2.0 * h, decay * decay
@@ -204,15 +193,11 @@ class RandomEvents:
         self._count: UInt32 = None  # events so far
 
     def _wait_us(self, key: UInt32, count: UInt32) -> Float64:
-        import drjit as dr
-
         types = jit()
         word = types.Philox4x32(dr.opaque(types.UInt64, self._stream_key), key, count).next_uint32x4()[0]
         return types.Float64(-dr.log(dr.fma(types.Float(word), 2.0**-32, 2.0**-33))) * self._mean_us
 
     def start(self, t_us: int) -> None:
-        import drjit as dr
-
         self._count = dr.zeros(jit().UInt32, dr.width(self._key))
         # opaque: a time written into the kernel would have the kernel compiled again for every time
         self._due_us = self._wait_us(self._key, self._count) + dr.opaque(jit().Float64, float(t_us))
@@ -222,8 +207,6 @@ class RandomEvents:
         """Times (µs) and pixels of the events up to `t_us`, µs. Each round has the next event of each pixel that has
         one.
         """
-        import drjit as dr
-
         types = jit()
         end_us = dr.opaque(types.Float64, float(t_us))
         # pixels with an event before the end; after each round those that have another one

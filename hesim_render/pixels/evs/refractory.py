@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, UInt32
 from hesim_render.pixels.arrays import take
 from hesim_render.pixels.evs.crossings import DueEvents, events_on_paths, level_at, listed
@@ -31,8 +32,6 @@ class Refractory:
     STATE = ("_ready_us",)
 
     def __init__(self, period_us: float, pixels: int) -> None:
-        import drjit as dr
-
         self._period_us = float(period_us)
         self._ready_us = dr.full(jit().Float64, LONG_AGO_US, pixels)
 
@@ -64,8 +63,6 @@ class Refractory:
         reference : the new one.
         t_us, pixel, polarity : the events, unsorted; the polarity times their `Origin`.
         """
-        import drjit as dr
-
         types = jit()
         theta_on, theta_off = thresholds
         level_0, level_1 = levels
@@ -105,8 +102,6 @@ class Refractory:
         due: DueEvents,
     ) -> tuple[NDArray[np.float64], NDArray, NDArray, NDArray]:
         """Events of some pixels whose levels go on paths of straight lines; see `events_on_paths`."""
-        import drjit as dr
-
         types = jit()
         index = types.UInt32(pixel)
         ready = np.array(dr.gather(types.Float64, self._ready_us, index))
@@ -129,8 +124,6 @@ class Refractory:
         begin_us, end_us : µs.
         pixel : their numbers; None for all.
         """
-        import drjit as dr
-
         types = jit()
         ready = self._ready_us if pixel is None else take(self._ready_us, pixel)
         awake = ready <= dr.opaque(types.Float64, end_us)

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError
 from hesim_render.core.units import S_PER_US, US_PER_S
@@ -29,7 +30,6 @@ _GOLDEN = 2654435769
 class _Mode(Protocol):
     def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
         """Events; the size of their polarity is their `Origin`, its sign the polarity itself."""
-        ...
 
 
 class Labels(Protocol):
@@ -158,8 +158,6 @@ class EvsStage:
         RangeError
             If `t_us` does not increase or the array has another size.
         """
-        import drjit as dr
-
         rows, cols = self.noise.layout.evs_shape
         if dr.width(electrons) != rows * cols:
             raise RangeError("number of event pixels", dr.width(electrons), f"{rows}×{cols}")

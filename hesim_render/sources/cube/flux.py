@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, ValidationError, model_validator
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Halves, UInt32
 from hesim_render.core.errors import ConflictError, RangeError, SpecError
 from hesim_render.core.tables import table
@@ -127,8 +128,6 @@ class CubeFlux(WindowByWindow):
 
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """See `FluxSource.mean_flux`; both halves are the same, as a cube has no Monte-Carlo error."""
-        import drjit as dr
-
         types = jit()
         pixels, begin, end = checked_windows(pixel, begin_us, end_us, self.sensor.rows * self.sensor.cols)
         if pixels.size == 0:
@@ -151,8 +150,6 @@ class CubeFlux(WindowByWindow):
 
     def _at(self, index: UInt32, time_s: Float) -> Float:
         """Φ at an instant."""
-        import drjit as dr
-
         types, options = jit(), self.options
         cols = self.sensor.cols
         row = index // cols
@@ -195,8 +192,6 @@ class CubeFlux(WindowByWindow):
 
 def _mirrored(place: Float, count: int) -> UInt32:
     """Index of a texel of an endless row of mirror images, for whole numbers of either sign."""
-    import drjit as dr
-
     types = jit()
     period = 2.0 * count
     inside = place - period * dr.floor(place / period)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, MitsubaObject, Point2, UInt32
 from hesim_render.core.tables import table
 from hesim_render.core.units import MM_PER_M
@@ -31,8 +32,6 @@ _MOST_LIGHT = 0.98
 
 def radius_of(sensor: Sensor, place: tuple[Float, Float]) -> Float:
     """Distance of column and row on the full sensor from the axis, px."""
-    import drjit as dr
-
     types, geometry = jit(), sensor.spec.geometry
     middle = [
         dr.opaque(types.Float, (count - 1) / 2 + axis / (geometry.pitch_um * 1e-3))
@@ -45,8 +44,6 @@ class _OverHeight:
     """A function of the image height on the device, linear between the values of an even table."""
 
     def __init__(self, sensor: Sensor, height_mm: list[float], values: NDArray[np.float64]) -> None:
-        import drjit as dr
-
         types, geometry = jit(), sensor.spec.geometry
         self._sensor = sensor
         pitch_mm = geometry.pitch_um * 1e-3
@@ -57,8 +54,6 @@ class _OverHeight:
 
     def at(self, place: tuple[Float, Float]) -> Float:
         """Value at columns and rows of the full sensor."""
-        import drjit as dr
-
         types = jit()
         index = dr.minimum(radius_of(self._sensor, place) * self._per_px, _HEIGHTS - 1)
         cell = dr.minimum(types.UInt32(index), _HEIGHTS - 2)
@@ -67,16 +62,9 @@ class _OverHeight:
 
 
 class GaussianBlur:
-    """A Gaussian, of one width or of a width that follows the image height.
-
-    Parameters
-    ----------
-    sensor : with the lens in use.
-    """
+    """A Gaussian, of one width or of a width that follows the image height; the sensor has the lens in use."""
 
     def __init__(self, sensor: Sensor) -> None:
-        import drjit as dr
-
         types, pitch_um, psf = jit(), sensor.spec.geometry.pitch_um, sensor.optics.psf
         widths = psf.fwhm_um if isinstance(psf, GaussianPsf) else [sensor.optics.psf_fwhm_um]
         sigma_px = np.array(widths) / FWHM_PER_SIGMA / pitch_um
@@ -104,8 +92,6 @@ class GaussianBlur:
 
     def offset(self, numbers: Point2, place: tuple[Float, Float] | None) -> tuple[Float, Float]:
         """Where a ray goes on relative to where it starts, px, for `numbers` in [0, 1) (Box-Muller)."""
-        import drjit as dr
-
         radius = self.sigma_px(place) * dr.sqrt(-2 * dr.log(1 - numbers[0]))
         sine, cosine = dr.sincos(2 * dr.pi * numbers[1])
         return radius * cosine, radius * sine
@@ -120,8 +106,6 @@ class KernelBlur:
     """
 
     def __init__(self, sensor: Sensor) -> None:
-        import drjit as dr
-
         types, psf = jit(), sensor.optics.psf
         assert isinstance(psf, MeasuredPsf)
         self._sensor = sensor
@@ -150,8 +134,6 @@ class KernelBlur:
 
     def offset(self, numbers: tuple[Point2, Float], place: tuple[Float, Float] | None) -> tuple[Float, Float]:
         """Where a ray goes on relative to where it starts, px; see `GaussianBlur.offset`."""
-        import drjit as dr
-
         types = jit()
         assert place is not None
         (u, v), luck = numbers
@@ -174,8 +156,6 @@ class KernelBlur:
 
 def _drawn(sums: Float, first: UInt32, count: int, u: Float) -> tuple[UInt32, Float]:
     """Entry of a table of running sums in which a number in [0, 1) lies, and its place inside it, 0 to 1."""
-    import drjit as dr
-
     types = jit()
     entry = dr.binary_search(0, count - 1, lambda k: dr.gather(types.Float, sums, first + types.UInt32(k)) <= u)
     entry = types.UInt32(entry)
@@ -207,8 +187,6 @@ class AiryBlur:
     """
 
     def __init__(self, sensor: Sensor) -> None:
-        import drjit as dr
-
         types = jit()
         self._radii = table(types.Float, airy_radii().astype(np.float32))
         scale = sensor.lens.working_f_number / (pi * sensor.spec.geometry.pitch_um * MM_PER_M)
@@ -217,8 +195,6 @@ class AiryBlur:
 
     def offset(self, numbers: Point2, wavelength_nm: Float) -> tuple[Float, Float]:
         """Where a ray goes on relative to where it starts, px, for `numbers` in [0, 1)."""
-        import drjit as dr
-
         types = jit()
         at = numbers[0] * _AIRY_PARTS
         cell = dr.minimum(types.UInt32(at), _AIRY_PARTS - 1)

@@ -274,10 +274,6 @@ def place_camera(scene: SceneSpec, sensor: Sensor, mitsuba_sensor: MitsubaCamera
     sensor : the sensor, with its own lens.
     mitsuba_sensor : sensor of the Mitsuba scene; needed only without a `camera` section.
 
-    Returns
-    -------
-    The placed camera.
-
     Raises
     ------
     SpecError

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Bands, Float, UInt32
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.exr import require_exr_fits
@@ -150,8 +151,6 @@ def _add_slice(
     halves: NDArray[np.float32],
 ) -> None:
     """Add the radiance of one slice with a weight to `halves`, [half, row, col, band]."""
-    import drjit as dr
-
     shape = tracer.view.sensor.layout.shape
     pixels = np.arange(tracer.pixel_count, dtype=np.uint32)
     # where a ray's path depends on its wavelength, it has a single one

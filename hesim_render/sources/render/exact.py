@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Bands, Float, Halves, UInt32
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.journal import Journal
@@ -54,8 +55,6 @@ def require_finite(half_a: Float, half_b: Float, scene: Scene, layout: Layout, p
     SpecError
         Names the scene file and the first such pixel.
     """
-    import drjit as dr
-
     if np.isfinite(dr.sum(half_a)[0]) and np.isfinite(dr.sum(half_b)[0]):
         return  # transfers one number to the host, not one per pixel
     both = np.array(half_a) + np.array(half_b)
@@ -186,8 +185,6 @@ class RenderedFlux(WindowByWindow):
 
     def _rays_per_second(self, every: NDArray[np.uint32]) -> float:
         """Speed of a small picture; a first one compiles the kernels, which the run needs as well."""
-        import drjit as dr
-
         count = min(every.size, max(1, _PIXELS // max(1, self.samples // 16)))
         if count == 0:
             return float("inf")
@@ -221,17 +218,11 @@ class RenderedFlux(WindowByWindow):
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """Mean Φ of each listed pixel over its own interval; see `FluxSource.mean_flux`.
 
-        Returns
-        -------
-        half_a, half_b : Dr.Jit Float [n], e⁻/s.
-
         Raises
         ------
         RangeError
             If a pixel lies outside the region or an interval ends before it begins.
         """
-        import drjit as dr
-
         pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
         if pixels.size == 0 or self._tracer.built.is_dark:
             zeros = dr.zeros(jit().Float, pixels.size)
@@ -251,14 +242,10 @@ class RenderedFlux(WindowByWindow):
         return half_a, half_b
 
     def _choose(self, pixel: UInt32, u: Float) -> list[Float]:
-        import drjit as dr
-
         return self._wavelengths.sample(dr.gather(jit().UInt32, self._filter, pixel), u)
 
     def _weigh(self, pixel: UInt32, radiance: Bands) -> list[Float]:
         """Mean of L times V · ∫R dλ, because wavelengths are distributed as R."""
-        import drjit as dr
-
         types = jit()
         total = self._wavelengths.total(dr.gather(types.UInt32, self._filter, pixel))
         # not dr.mean: it puts the number of lanes into the kernel, so that each new number would compile again

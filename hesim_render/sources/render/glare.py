@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Bands, Float, Halves, UInt32
 from hesim_render.core.distinct import distinct_columns
 from hesim_render.core.rng import Stream
@@ -70,8 +71,6 @@ class VeilingGlare:
 
     def _means(self, spans_us: NDArray[np.float64]) -> NDArray[np.float64]:
         """Mean over the sensor and some intervals, [filter, half]."""
-        import drjit as dr
-
         types, count = jit(), self._index.size
         means = np.zeros((max(self._filters) + 1, 2))
         begin, end = spans_us[:, np.arange(count) % spans_us.shape[1]]

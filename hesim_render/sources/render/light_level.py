@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.core.rng import Stream, stream_key
@@ -161,8 +162,6 @@ class _Meter:
 
     def estimates(self, rays: int, stream: Stream) -> np.ndarray:
         """Independent estimates of the level from `rays` rays each, a power of two."""
-        import drjit as dr
-
         types = jit()
         key = dr.opaque(types.UInt64, stream_key(0, stream))
         at_once = max(1, _BLOCK // rays)
@@ -178,8 +177,6 @@ class _Meter:
 
     def _level(self) -> Float:
         """Level from one ray per lane."""
-        import drjit as dr
-
         mi, scene, sampler = self._mi, self._scene, self._sampler
         index = mi.UInt32(0)
         bands = mi.UnpolarizedSpectrum(*self._wavelengths.sample(index, sampler.next_1d()))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.camera import View, place_camera
@@ -58,10 +59,6 @@ def look(scene: Scene, sensor: Sensor) -> FramingLook:
     ----------
     scene, sensor : from `load_scene` and `load_sensor`, cropped to the region that is read out.
 
-    Returns
-    -------
-    The picture and the place of the target.
-
     Raises
     ------
     SpecError
@@ -89,8 +86,6 @@ def look(scene: Scene, sensor: Sensor) -> FramingLook:
 
 def _colours(mi: MitsubaModule, scene: MitsubaObject, view: View, x: NDArray, y: NDArray) -> NDArray[np.float64]:
     """Colours of the first surfaces behind places of the region (0, 0 is its upper left corner), [n, 3]."""
-    import drjit as dr
-
     types = jit()
     layout = view.sensor.layout
     row = types.Float((y + layout.row0 - 0.5).astype(np.float32))

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, MitsubaObject, Point2, Point3, Vector3
 from hesim_render.core.tables import table
 from hesim_render.core.units import MM_PER_M
 from hesim_render.sources.render.blur import AiryBlur, GaussianBlur, KernelBlur
 from hesim_render.sources.render.camera import View
 from hesim_render.sources.render.projection import DeviceProjection
-from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
+from hesim_render.sources.render.scene.builder import NeedsExactMode
 from hesim_render.specs.lens import MeasuredPsf
 from hesim_render.spectral.spectrum import RENDERABLE_NM
 
@@ -37,8 +38,6 @@ class RayFactory:
     """
 
     def __init__(self, view: View) -> None:
-        import drjit as dr
-
         types = jit()
         sensor, optics, lens = view.sensor, view.sensor.optics, view.sensor.lens
         self._projection, self._optics = DeviceProjection(view.projection), optics
@@ -159,8 +158,6 @@ class RayFactory:
         -------
         Origin and unit direction in world space, with the camera at rest; and the weight of each ray, None for 1.
         """
-        import drjit as dr
-
         col, row = place
         if not self.has_pupil and self._shrink is None:
             return *self.towards(row, col, *offset), weight
@@ -200,8 +197,6 @@ class RayFactory:
         """Rays in world space with tangents to the right and downwards, from a point of the pupil in camera space, m;
         None for its centre.
         """
-        import drjit as dr
-
         types = jit()
         local = dr.normalize(types.Array3f(x, -y, -1.0))
         direction = types.Array3f(*(r[0] * local.x + r[1] * local.y + r[2] * local.z for r in self._rotation))
@@ -221,8 +216,6 @@ class RayFactory:
 
     def density(self, x: Float, y: Float, place: tuple[Float, Float] | None = None) -> Float:
         """Density of the places that `offset` gives, 1/pixel²; cut off beyond `reach_px`."""
-        import drjit as dr
-
         reach = self.reach_px
         inside = (abs(x) <= reach) & (abs(y) <= reach)
         if not isinstance(self._blur, GaussianBlur):
@@ -246,8 +239,6 @@ class RayFactory:
         px_per_m : image of a short length at that place, along the direction in which it is longest; 0 behind the
             pupil.
         """
-        import drjit as dr
-
         types = jit()
         away = types.Array3f(point) - types.Array3f(*self._origin)
         x, y, z = (sum(self._rotation[row][axis] * away[row] for row in range(3)) for axis in range(3))

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Float64
 from hesim_render.core.errors import SpecError
 from hesim_render.core.tables import table
@@ -113,16 +114,9 @@ class Projection:
 
 
 class DeviceProjection:
-    """`Projection.unproject` on the device, in float32.
-
-    Parameters
-    ----------
-    projection : the projection.
-    """
+    """`Projection.unproject` on the device, in float32."""
 
     def __init__(self, projection: Projection) -> None:
-        import drjit as dr
-
         types = jit()
         # opaque, so that another lens or sensor needs no new kernel
         self._middle = [dr.opaque(types.Float, centre) for centre in projection.centre_px]
@@ -161,8 +155,6 @@ class DeviceProjection:
         """Column and row of tangents, the inverse of `tangents`; and at most so many pixels per unit of tangent
         there.
         """
-        import drjit as dr
-
         scale = dr.rcp(self._step)
         if self._distortion is None:
             return x * scale + self._middle[0], y * scale + self._middle[1], scale
@@ -174,8 +166,6 @@ class _DeviceDistortion:
     """`Distortion` on the device, in float32; beyond its limit, directions are those at the limit."""
 
     def __init__(self, distortion: Distortion) -> None:
-        import drjit as dr
-
         types = jit()
         self._is_fisheye = distortion.model == "fisheye"
         self._k = [dr.opaque(types.Float, value) for value in distortion.coefficients]
@@ -190,8 +180,6 @@ class _DeviceDistortion:
         dr.make_opaque(self._ratio)
 
     def _formula(self, x: Float, y: Float, exact: bool = False) -> tuple[Any, ...]:
-        import drjit as dr
-
         k = self._exact if exact else self._k
         if self._is_fisheye:
             return fisheye(k, x, y, dr.atan2, dr.sqrt, dr.maximum)
@@ -199,8 +187,6 @@ class _DeviceDistortion:
 
     def distorted(self, x: Float, y: Float) -> tuple[Float, Float, Float]:
         """Image place, and the largest factor by which it moves for a tangent."""
-        import drjit as dr
-
         inside = dr.minimum(self._limit * dr.rsqrt(dr.maximum(x * x + y * y, 1e-30)), 1)
         u, v, xx, xy, yy = self._formula(x * inside, y * inside)
         return u, v, dr.sqrt(xx * xx + 2 * xy * xy + yy * yy)
@@ -210,8 +196,6 @@ class _DeviceDistortion:
 
         The last residual is computed in float64: rounding of the model would be 0.001 px at the border of a fisheye.
         """
-        import drjit as dr
-
         types = jit()
         distance = dr.sqrt(u * u + v * v)
         inside = dr.minimum(types.Float64(self._most) / dr.maximum(distance, 1e-30), 1)

@@ -22,12 +22,10 @@ class SceneRenderer(Renderer, Protocol):
     @property
     def view(self) -> View:
         """The placed camera at rest."""
-        ...
 
     @property
     def samples(self) -> int | None:
         """Rays per pixel and slice, where all pixels get the same number; None where each gets what its error takes."""
-        ...
 
 
 class FlickerRenderer(FlickerFlux):

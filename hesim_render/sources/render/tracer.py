@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit, select
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Bands, Float, Halves, UInt32, UInt64
 from hesim_render.core.errors import RangeError
 from hesim_render.core.journal import Journal, key_of
@@ -75,8 +76,6 @@ class Tracer:
         block_rays: int | None,
     ) -> None:
         mi, types = mitsuba(), jit()
-        import drjit as dr
-
         self.progress, self._block_rays, self.rays_done = progress, block_rays or rays_at_once(), 0
         self._journal: Journal | None = None
         self._run_part: tuple[object, ...] = ()
@@ -139,8 +138,6 @@ class PixelTracer(Tracer):
         progress: Callable[[int], None] | None = None,
         block_rays: int | None = None,
     ) -> None:
-        import drjit as dr
-
         if samples < 2 or samples % 2:
             raise RangeError("samples", samples, "an even number of rays per pixel, 2 or more")
         most = block_rays or rays_at_once()
@@ -196,8 +193,6 @@ class PixelTracer(Tracer):
         RangeError
             If a pixel lies outside the region or an interval ends before it begins.
         """
-        import drjit as dr
-
         mitsuba()  # the variant may have been changed by other code
         begin, end = np.asarray(begin_us, dtype=np.float64), np.asarray(end_us, dtype=np.float64)
         full, key = (self._full_index, self._key) if elsewhere is None else (elsewhere, self._elsewhere_key)
@@ -247,8 +242,6 @@ class PixelTracer(Tracer):
         values: Values,
     ) -> list[Halves]:
         """Both halves of a few pixels."""
-        import drjit as dr
-
         types = jit()
         count, per_half = pixels.size, self.samples // 2
 
@@ -281,8 +274,6 @@ class PixelTracer(Tracer):
         values: Values,
     ) -> list[Float]:
         """The wanted quantities of one ray per lane."""
-        import drjit as dr
-
         mi, types = self.built.mi, jit()
         row, col = self._row_and_col(index)
         sampler = self._sampler

@@ -65,17 +65,13 @@ def estimate_of_counts(sensor: Sensor, duration_us: int, pictures: int, seconds_
 
 
 def event_notes(spec: EvsSpec, period_us: float, is_held: bool) -> list[str]:
-    """Notes for the user of a video in front of event pixels, in sentences.
+    """Notes for the user of a video in front of event pixels, in sentences; none where events follow the pictures.
 
     Parameters
     ----------
     spec : the event pixels.
     period_us : time from one picture to the next, µs.
     is_held : each picture is held until the next one; otherwise the light goes in a straight line between them.
-
-    Returns
-    -------
-    No note where events follow the pictures.
     """
     if spec.tick_us is None:
         return [

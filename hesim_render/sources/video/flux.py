@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Halves
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.progress import Progress
@@ -87,8 +88,6 @@ class VideoFlux(WindowByWindow, Untraced):
     is_static = False
 
     def __init__(self, source: Source, sensor: Sensor, options: VideoOptions | None = None) -> None:
-        import drjit as dr
-
         self.options = options = options or VideoOptions()
         self.sensor = sensor
         self._reader = open_video(source, options)
@@ -178,8 +177,6 @@ class VideoFlux(WindowByWindow, Untraced):
         The first picture is held before its time, the last one after its time. Both halves are the same, as a video has
         no Monte-Carlo error.
         """
-        import drjit as dr
-
         types = jit()
         pixels, begin, end = checked_windows(pixel, begin_us, end_us, self.sensor.rows * self.sensor.cols)
         if pixels.size == 0:
@@ -195,8 +192,6 @@ class VideoFlux(WindowByWindow, Untraced):
 
     def _flux_of(self, number: int) -> Float:
         """Φ of all mosaic pixels in one picture, Dr.Jit Float [row · cols + col], e⁻/s."""
-        import drjit as dr
-
         cached = self._maps.get(number)
         if cached is not None:
             return cached
@@ -297,8 +292,6 @@ def _common(begin: NDArray[np.float64], end: NDArray[np.float64]) -> tuple[NDArr
 
 
 def _device(share: NDArray[np.float64]) -> Float:
-    import drjit as dr
-
     types = jit()
     if share.ndim == 0:
         return dr.opaque(types.Float, float(np.float32(share)))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.errors import RangeError
 
@@ -109,8 +110,6 @@ class Resampler:
     """Applies a mapping to planes on the device: along columns first, then along rows."""
 
     def __init__(self, mapping: Mapping) -> None:
-        import drjit as dr
-
         types = jit()
         self._mapping = mapping
         rows, cols = mapping.rows.first.size, mapping.cols.first.size
@@ -125,8 +124,6 @@ class Resampler:
 
     def __call__(self, planes: list[Float]) -> list[Float]:
         """[row · width + col] of the picture to [row · cols + col] of the region, Dr.Jit Float, not evaluated."""
-        import drjit as dr
-
         types = jit()
         if self._mapping.is_identity:
             return planes
@@ -158,8 +155,6 @@ class Resampler:
         target : row or column of the region, of each lane.
         place_of : place in a plane of a source row or column, of each lane.
         """
-        import drjit as dr
-
         types = jit()
         axis = (self._mapping.rows, self._mapping.cols)[which]
         first = dr.gather(types.UInt32, self._first[which], target)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.sources.video.colours import ColourTags, code_scale, yuv_to_rgb
 from hesim_render.sources.video.picture import PictureFormat, Planes
@@ -32,8 +33,6 @@ class Lineariser:
     """
 
     def __init__(self, shape: PictureFormat, tags: ColourTags) -> None:
-        import drjit as dr
-
         types = jit()
         self._shape, self._types = shape, types
         self._is_light = tags.transfer == "linear" and shape.bits == 0
@@ -54,8 +53,6 @@ class Lineariser:
         dr.eval(self._table, self._by_code, self._index)
 
     def _opaque(self, *values: float) -> list[Float]:
-        import drjit as dr
-
         return [dr.opaque(self._types.Float, float(np.float32(value))) for value in values]
 
     def linear(self, planes: Planes) -> list[Float]:
@@ -74,14 +71,10 @@ class Lineariser:
         return [self._light(self._scaled(code)) for code in codes]
 
     def _gather(self, table: Float, index: UInt32) -> Float:
-        import drjit as dr
-
         return dr.gather(self._types.Float, table, index)
 
     def _interleaved(self, picture: NDArray) -> list[Float]:
         """R, G and B of [row, col, 3]. Bytes are extracted from whole words, which is three times as fast."""
-        import drjit as dr
-
         types = self._types
         if picture.dtype != np.uint8:
             samples, first = self._samples(picture), self._index * 3
@@ -98,8 +91,6 @@ class Lineariser:
 
     def _samples(self, plane: NDArray) -> Float:
         """A function from indices into a plane (None: all of it, in order) to its values as Float."""
-        import drjit as dr
-
         types = self._types
         flat = plane.reshape(-1)
         if flat.dtype == np.uint16:  # two to a word: Dr.Jit has no 16-bit integers
@@ -121,8 +112,6 @@ class Lineariser:
 
     def _light(self, value: Float) -> Float:
         """Linear light of picture values, from the table."""
-        import drjit as dr
-
         types = self._types
         place = dr.clip(value * float(_STEPS), 0.0, float(self._top))
         index = types.UInt32(place)
@@ -156,8 +145,6 @@ class Lineariser:
 
     def _between(self, place: UInt32, shift: int, count: int, aligned: bool) -> tuple[UInt32, UInt32, Float | None]:
         """Chroma samples before and after a luma position along one axis, and the fraction of the way between them."""
-        import drjit as dr
-
         types = self._types
         if shift == 0:
             return place, place, None

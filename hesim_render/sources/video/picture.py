@@ -76,15 +76,12 @@ class Reader(Protocol):
 
     def read(self, index: int) -> Planes:
         """The picture of this number, 0 first."""
-        ...
 
     def start_digest(self) -> None:
         """Start hashing the input in parallel to the run."""
-        ...
 
     def describe(self) -> Mapping[str, Any]:
         """The manifest's entry for the input: name, hash, size, format; plain values. Waits for the hash."""
-        ...
 
     def close(self) -> None: ...
 

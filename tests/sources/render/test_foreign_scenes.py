@@ -26,11 +26,10 @@ from hesim_render.sources.render.change_driven.sample_instants import STEP_PX, M
 from hesim_render.sources.render.change_driven.tuning import TUNING
 from hesim_render.sources.render.exact import RenderedFlux, used_responses
 from hesim_render.sources.render.scene import plugin_tables
-from hesim_render.sources.render.scene.builder import build
+from hesim_render.sources.render.scene.builder import NeedsExactMode, build
 from hesim_render.sources.render.scene.mitsuba_scene import _plugin_dict
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.scene.trajectory import Trajectory
-from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
 from hesim_render.sources.scene import Scene
 from hesim_render.specs.motion import TrackSpec
 

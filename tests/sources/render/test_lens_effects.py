@@ -17,7 +17,7 @@ from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.glare import VeilingGlare
 from hesim_render.sources.render.primary_rays import RayFactory
-from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
+from hesim_render.sources.render.scene.builder import NeedsExactMode
 from hesim_render.spectral.spectrum import RENDERABLE_NM
 
 CAMERA = {"origin_m": [0, 0, 1]}

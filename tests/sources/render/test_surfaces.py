@@ -10,7 +10,7 @@ from rendering import d65_irradiance, electrons_per_s, flux_image, make_scene, m
 import hesim_render as hr
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
+from hesim_render.sources.render.scene.builder import NeedsExactMode
 from hesim_render.sources.scene import light_parts
 
 CAMERA = {"origin_m": [0, 0, 2], "target_m": [0, 0, 0], "horizontal_fov_deg": 22.62}

@@ -48,10 +48,6 @@ def compare_ticks(
     error : standard error of `run`, [window, unit].
     thresholds : θ₊ and θ₋ of each unit's pixel, [unit].
     core : [window], windows in which events are counted.
-
-    Returns
-    -------
-    Counts per unit.
     """
     true, in_run, missed, extra, flips = counts = [np.zeros(run.shape[1]) for _ in range(5)]
     change, wanted = np.diff(run, axis=0), np.diff(reference, axis=0)
@@ -98,10 +94,6 @@ def compare_crossings(
     ----------
     run, reference, error, thresholds, core : as for `compare_ticks`.
     most : largest number of events that is counted in a unit.
-
-    Returns
-    -------
-    Counts per unit.
     """
     count = run.shape[1]
     true, in_run, missed, extra, flips = (np.zeros(count) for _ in range(5))
@@ -139,10 +131,6 @@ def compare_crossings(
 
 class Tally:
     """Results of the units, arrays [unit] in the random order in which units are examined.
-
-    Parameters
-    ----------
-    units : number of units.
 
     Attributes
     ----------

@@ -35,10 +35,6 @@ def upper_bound(values: NDArray[np.float64], confidence: float) -> float:
     ----------
     values : [n], in [0, 1].
     confidence : 1 − α; it holds for all n together.
-
-    Returns
-    -------
-    The bound, in [0, 1].
     """
     # most draws are alike: each value is looked at once
     distinct, count = np.unique(values, return_counts=True)
@@ -61,10 +57,6 @@ def ratio_upper_bound(part: NDArray[np.float64], whole: NDArray[np.float64], mos
     part, whole : [n], 0 or more.
     most : largest possible value of `part`.
     confidence : 1 − α; it holds for all n together.
-
-    Returns
-    -------
-    The bound, in [0, 1].
     """
     pairs, count = np.unique(part + 1j * whole, return_counts=True)
     return _least(lambda r: (r * pairs.imag - pairs.real) / most, confidence, count)

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, MitsubaModule, MitsubaObject, Point2, UInt32, UInt64
 
 #: Number of index bits that one table of the third generator matrix covers.
@@ -68,8 +69,6 @@ def zero_two_point(index: UInt32) -> tuple[UInt32, UInt32]:
     The second generator matrix is Pascal's triangle modulo 2, the fifth Kronecker power of [[1, 1], [0, 1]]: five
     steps, one for each.
     """
-    import drjit as dr
-
     x = dr.brev(index)
     y = x
     for shift, mask in ((1, 0xAAAAAAAA), (2, 0xCCCCCCCC), (4, 0xF0F0F0F0), (8, 0xFF00FF00), (16, 0xFFFF0000)):
@@ -95,7 +94,6 @@ def third_coordinates(first_bit: int, bits: int) -> NDArray[np.uint32]:
 @functools.cache
 def sampler_class(variant: str) -> type[MitsubaObject]:
     """`CounterSampler` for one Mitsuba variant (its base class differs between variants)."""
-    import drjit as dr
     import mitsuba
 
     mi: MitsubaModule = mitsuba

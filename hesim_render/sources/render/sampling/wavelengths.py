@@ -9,6 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, UInt32
 from hesim_render.core.tables import table
 from hesim_render.spectral.spectrum import Spectrum
@@ -33,8 +34,6 @@ class WavelengthSampler:
     """
 
     def __init__(self, responses: Mapping[str, Spectrum]) -> None:
-        import drjit as dr
-
         types = jit()
         room = max(response.wavelength_nm.size for response in responses.values()) + 1
         cells, shares, starts, totals = [], [], [], []
@@ -62,8 +61,6 @@ class WavelengthSampler:
 
     def total(self, filter_index: UInt32) -> Float:
         """∫R dλ of each lane's filter, e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹ × nm."""
-        import drjit as dr
-
         return dr.gather(jit().Float, self._totals, filter_index)
 
     def sample(self, filter_index: UInt32, u: Float) -> list[Float]:
@@ -74,8 +71,6 @@ class WavelengthSampler:
         filter_index : Dr.Jit UInt32 per ray.
         u : Float in [0, 1).
         """
-        import drjit as dr
-
         types = jit()
         floats, uints = types.Float, types.UInt32
         base = filter_index * self._room

@@ -22,15 +22,15 @@ from hesim_render.sources.render.scene.mitsuba_version import (
     can_move,
     files_readable,
     make_mesh,
+    number_of,
     settle_normals,
     spectrum_dict,
     transform,
 )
-from hesim_render.sources.render.scene.paint import Paint
 from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.sources.render.scene.pictures import picture_texture
 from hesim_render.sources.render.scene.scene_spectra import check_coverage, target_pieces
-from hesim_render.sources.render.scene.surfaces import area_emitter, bsdf_of, is_diffuse, paint_of, radiance_of
+from hesim_render.sources.render.scene.surfaces import Paint, area_emitter, bsdf_of, is_diffuse, paint_of, radiance_of
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals
 from hesim_render.specs.geometry import rotation_about
@@ -124,10 +124,6 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
     mi : the mitsuba module with the wanted variant set.
     spec : content of the scene file.
     responses : spectra that light and reflectance must cover (≥ 99.9 % of each), by name.
-
-    Returns
-    -------
-    The loaded scene.
 
     Raises
     ------
@@ -288,3 +284,22 @@ def _box_mesh() -> tuple[NDArray, NDArray, NDArray]:
             vertices.append(face)
             uv.append(flat_uv)
     return np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv)
+
+
+class NeedsExactMode(SpecError):
+    """The scene needs the exact mode: paths between resting and rigidly moving surfaces do not describe it."""
+
+
+def require_paths(built: BuiltScene) -> None:
+    """Refuse scenes that paths between surfaces do not describe."""
+    if built.exact_because is not None:
+        raise NeedsExactMode(built.exact_because)
+    name = built.integrator.class_name()
+    if name == "DirectIntegrator":
+        for kind in ("emitter_samples", "bsdf_samples"):
+            if number_of(built.integrator, kind) == 0:
+                raise NeedsExactMode(f"integrator 'direct': with {kind} 0 it leaves light out")
+    elif name != "PathIntegrator":
+        raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
+    if built.integrator.hide_emitters:
+        raise NeedsExactMode("the integrator hides lights that are seen directly")

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading
@@ -90,8 +91,6 @@ def level_on_plane(
     normal : unit normal of the plane, [3].
     in_lux : weigh by the luminous efficiency.
     """
-    import drjit as dr
-
     rows, cols = shape
     # two points in each cell between texels, as multiples of its size; texels lie on both poles, and half a column from
     # the seam

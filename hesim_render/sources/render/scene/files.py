@@ -46,10 +46,6 @@ class SceneFiles:
         Nothing outside is opened. Names are read as Mitsuba does: in the order of the text, with the parameters
         (``$name``) and folders (``<path>``) that are known there.
 
-        Parameters
-        ----------
-        file : the XML file.
-
         Raises
         ------
         SpecError

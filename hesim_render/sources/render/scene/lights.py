@@ -15,6 +15,7 @@ from hesim_render.sources.render.scene.environment import environment
 from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict, transform
 from hesim_render.specs.light import LightSpec, irradiance
 from hesim_render.spectral.spectrum import Spectrum, summed
+from hesim_render.targets.piece import clipped
 
 #: Least cosine at which a light can still set a level on its plane.
 _GRAZING = 1e-6
@@ -34,7 +35,7 @@ def form_factor_integral(
     point : [3], m.
     normal : unit normal of the plane, [3].
     """
-    rays = _clip_to_horizon(corners - point, normal)
+    rays = clipped(corners - point, (corners - point) @ normal)
     if len(rays) < 3:
         return 0.0
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -44,19 +45,6 @@ def form_factor_integral(
     angle = np.arctan2(sine, np.sum(rays * following, axis=1))
     weight = np.divide(angle, sine, out=np.zeros_like(angle), where=sine > 0)
     return abs(float(0.5 * np.sum(weight * (cross @ normal))))
-
-
-def _clip_to_horizon(rays: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The part of a polygon on the side of the plane through the origin that `normal` points to."""
-    height = rays @ normal
-    kept: list[NDArray[np.float64]] = []
-    for i in range(len(rays)):
-        j = (i + 1) % len(rays)
-        if height[i] >= 0:
-            kept.append(rays[i])
-        if (height[i] >= 0) != (height[j] >= 0):
-            kept.append(rays[i] + (rays[j] - rays[i]) * (height[i] / (height[i] - height[j])))
-    return np.array(kept)
 
 
 def area_light_frame(light: LightSpec) -> NDArray[np.float64]:
@@ -84,11 +72,6 @@ def emitters(mi: MitsubaModule, given: Sequence[LightSpec]) -> dict[str, Any]:
     become one sky of their sum. ``point``: I = E d²/cos θ. ``directional``: E/cos θ across the beam. ``area``:
     a one-sided Lambertian rectangle, L = E / ∫ cos θ dω exactly, black if it is switched off. ``environment``: see
     there.
-
-    Parameters
-    ----------
-    mi : the mitsuba module.
-    given : lights of the scene file.
 
     Raises
     ------

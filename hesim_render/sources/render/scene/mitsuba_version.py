@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core import backend
 from hesim_render.core.child import interrupts_held
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.vertex_normals import ordered_normals
@@ -66,8 +67,6 @@ def files_readable() -> Iterator[None]:
 
     It reads and writes EXR files in tasks of its thread pool, and one of them waits for others.
     """
-    import drjit as dr
-
     before = dr.thread_count()
     if before >= _LEAST_THREADS:
         yield

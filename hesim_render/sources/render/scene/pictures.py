@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Interaction, Mask, MitsubaModule
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.mitsuba_version import transform
@@ -51,7 +52,6 @@ def _scaled(mi: MitsubaModule, repeat: tuple[int, int]) -> Any:
 @functools.cache
 def _spectral_texture(variant: str) -> type:
     """The class of textures with one plane per wavelength; its base class depends on the variant."""
-    import drjit as dr
     import mitsuba as mi
 
     class SpectralPicture(mi.Texture):  # type: ignore[misc, name-defined]

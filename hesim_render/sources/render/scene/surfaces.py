@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.files import require_material
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, spectrum_dict, transform
-from hesim_render.sources.render.scene.paint import Paint
 from hesim_render.sources.render.scene.pictures import picture_texture
 from hesim_render.sources.render.scene.plugin_tables import HONOURED, REFUSED
 from hesim_render.sources.render.scene.sizes import require_fits
@@ -23,6 +23,24 @@ from hesim_render.targets.cube import read_picture
 
 #: Shapes without an inside; both of their sides are visible.
 _OPEN_SHAPES = ("rectangle", "mesh")
+
+
+@dataclass(frozen=True)
+class Paint:
+    """Paint of a shape: one diffuse colour, or a checkerboard of two.
+
+    Parameters
+    ----------
+    shape : id of the shape in the Mitsuba scene.
+    colours : one or two reflectances.
+    scale : factors on (u, v) of the shape; the squares of the checkerboard then have a side of one half.
+    two_sided : True if the back is painted as well; otherwise the back is black.
+    """
+
+    shape: str
+    colours: tuple[Spectrum, ...]
+    scale: tuple[float, float] = (1.0, 1.0)
+    two_sided: bool = False
 
 
 def is_diffuse(item: ObjectSpec) -> bool:
@@ -49,12 +67,6 @@ def area_emitter(radiance: Spectrum | None) -> dict[str, Any] | None:
 
 def bsdf_of(mi: MitsubaModule, item: ObjectSpec, spec: SceneSpec) -> Any:
     """BSDF of an object, or its dictionary for Mitsuba. Open shapes that reflect only do so on both sides.
-
-    Parameters
-    ----------
-    mi : the mitsuba module.
-    item : the object.
-    spec : its scene.
 
     Raises
     ------

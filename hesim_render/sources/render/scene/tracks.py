@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, Point3, UInt32, Vector3
 from hesim_render.core.tables import table
 
@@ -27,8 +28,6 @@ class DevicePose:
     @classmethod
     def about(cls, w: Float, v: Vector3, pivot: Point3, shift: Vector3) -> DevicePose:
         """x → R (x − pivot) + pivot + shift, R from the unit quaternion (w, v)."""
-        import drjit as dr
-
         x, y, z = v
         vector = type(v)
         rest = cls(
@@ -44,32 +43,22 @@ class DevicePose:
     @classmethod
     def none(cls, vector: type[Vector3]) -> DevicePose:
         """The identity."""
-        import drjit as dr
-
         return cls((vector(1, 0, 0), vector(0, 1, 0), vector(0, 0, 1)), dr.zeros(vector))
 
     def where(self, condition: Mask, other: DevicePose) -> DevicePose:
         """This pose in lanes where a condition holds, `other` in the rest."""
-        import drjit as dr
-
         columns = (dr.select(condition, a, b) for a, b in zip(self.columns, other.columns, strict=True))
         return DevicePose(tuple(columns), dr.select(condition, self.shift, other.shift))
 
     def turn_to_world(self, direction: Vector3) -> Vector3:
-        import drjit as dr
-
         (x, y, z), (first, second, third) = direction, self.columns
         return dr.fma(first, x, dr.fma(second, y, third * z))
 
     def to_world(self, point: Point3) -> Point3:
-        import drjit as dr
-
         (x, y, z), (first, second, third) = point, self.columns
         return dr.fma(first, x, dr.fma(second, y, dr.fma(third, z, self.shift)))
 
     def turn_to_rest(self, direction: Vector3) -> Vector3:
-        import drjit as dr
-
         vector = type(self.shift)
         return vector(*(dr.dot(column, vector(direction)) for column in self.columns))
 
@@ -78,16 +67,9 @@ class DevicePose:
 
 
 class Tracks:
-    """Tracks of several objects in tables, so that one kernel serves any number of them.
-
-    Parameters
-    ----------
-    trajectories : one or more.
-    """
+    """Tracks of several objects in tables, so that one kernel serves any number of them."""
 
     def __init__(self, trajectories: Sequence[Trajectory]) -> None:
-        import drjit as dr
-
         types = jit()
         rows: list[NDArray[np.float64]] = []
         times: list[NDArray[np.float64]] = []
@@ -126,8 +108,6 @@ class Tracks:
         number : number of its track, an integer or UInt32.
         local_us : Float, time since that track's first keyframe, µs, see `Trajectory.pose_at`.
         """
-        import drjit as dr
-
         types = jit()
         number = types.UInt32(number)
         first_time, first_row, knots, period = dr.gather(types.Array4f, self._heads, 2 * number)

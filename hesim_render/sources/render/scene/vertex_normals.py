@@ -26,7 +26,7 @@ _SERIALIZED_NORMALS, _SERIALIZED_HEAD = 0x0001, 1 << 12
 
 
 def ordered_normals(vertices_m: NDArray[np.floating], faces: NDArray[np.integer]) -> NDArray[np.float32]:
-    """Unit normals of vertices: the normals of their faces, weighted with the angles of the faces at the vertex.
+    """Unit normals of vertices: normals of their faces, weighted with the angles of the faces at them, [vertex, 3].
 
     A pure function of the mesh: terms are added in the order of the faces, in float64. The weights are those of
     [thurmer1998], as in Mitsuba. A vertex whose normals cancel has the normal of its last face, and one without a face
@@ -36,10 +36,6 @@ def ordered_normals(vertices_m: NDArray[np.floating], faces: NDArray[np.integer]
     ----------
     vertices_m : [vertex, 3], m.
     faces : [face, 3], numbers of vertices.
-
-    Returns
-    -------
-    [vertex, 3].
     """
     corners = np.asarray(vertices_m, dtype=np.float64)[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import (
     DeviceArray,
     Float,
@@ -116,8 +117,6 @@ def _parallelogram(
 
 def _at_corners(mi: MitsubaModule, shape: MitsubaObject) -> dict[str, NDArray[np.float64]]:
     """Mitsuba's surface data at the corners of a mesh's triangles, [faces, 2, 3 corners, ...] each."""
-    import drjit as dr
-
     count = shape.face_count()
     hit = dr.zeros(mi.PreliminaryIntersection3f, 3 * count)
     hit.valid, hit.t, hit.shape = mi.Bool(True), mi.Float(1.0), mi.ShapePtr(shape)
@@ -179,8 +178,6 @@ class Part:
     """
 
     def __init__(self, mi: MitsubaModule, scene: MitsubaObject, apart: bool, faces_before: int = 0) -> None:
-        import drjit as dr
-
         self._mi, self._faces_before = mi, faces_before
         #: Centre and squared radius of each ball, and its shape.
         self._balls: list[tuple[Point3, Float, MitsubaObject]] = []
@@ -227,8 +224,6 @@ class Part:
             face.
         face : UInt32, `faces_before` + 1 to + `face_count` for a face, and 0 for anything else.
         """
-        import drjit as dr
-
         mi = self._mi
         face = mi.UInt32(0)
         if self._scene is not None:
@@ -266,8 +261,6 @@ class Part:
 
     def describe_faces(self, si: Interaction, hit: Interaction, face: UInt32) -> None:
         """Fill in normals, axes, texture coordinates and triangles of lanes that hit a face of this part."""
-        import drjit as dr
-
         u, v = hit.prim_uv
         second = u + v > 1
         n, shading, s, dp_du, dp_dv = si.n, si.sh_frame.n, si.sh_frame.s, si.dp_du, si.dp_dv
@@ -310,8 +303,6 @@ def surface_of(
     flags : `RayFlags`, fields to compute. Faces always have all fields.
     active : lanes in which a result is needed.
     """
-    import drjit as dr
-
     si = hit.compute_surface_interaction(ray, flags, active & (face == 0))
     if not any(part.face_count for part in parts):
         return si

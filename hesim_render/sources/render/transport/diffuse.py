@@ -27,6 +27,7 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import (
     Float,
     Interaction,
@@ -39,7 +40,7 @@ from hesim_render.core.device_types import (
 )
 from hesim_render.core.tables import table
 from hesim_render.sources.render.scene import lights
-from hesim_render.sources.render.scene.paint import Paint
+from hesim_render.sources.render.scene.surfaces import Paint
 from hesim_render.sources.render.transport.irradiance import RectangleLight
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.outlines import OccludedSky
@@ -70,8 +71,6 @@ class DiffuseIntegrator:
         given: Sequence[LightSpec],
         responses: Mapping[str, Spectrum],
     ) -> None:
-        import drjit as dr
-
         mi = scene.mi
         self._scene = scene
         levels = [irradiance(light) for light in given]
@@ -125,8 +124,6 @@ class DiffuseIntegrator:
         """Tables of paints, by the number that Dr.Jit gives a shape, and of fluxes by (light, filter, colour) and
         (light, filter).
         """
-        import drjit as dr
-
         mi = self._scene.mi
         numbers = {}
         for name, shape in self._scene.shapes.items():
@@ -163,8 +160,6 @@ class DiffuseIntegrator:
         unshadowed : Float, the flux if nothing hid any light, e⁻/s.
         met : Bool, True where the path came through the box of a moving object.
         """
-        import drjit as dr
-
         mi, scene = self._scene.mi, self._scene
         surface = scene.intersect(ray, moment, True, mi.Bool(True), mi.RayFlags.UV | mi.RayFlags.ShadingFrame)
         si, met = surface.rest, surface.met
@@ -217,8 +212,6 @@ class _Lamp:
     """A rectangle light; its strength is its radiance."""
 
     def __init__(self, mi: MitsubaModule, frame: NDArray[np.float64], geometry: float) -> None:
-        import drjit as dr
-
         self._rectangle = RectangleLight(mi, frame)
         self._scale = dr.opaque(mi.Float, 1 / geometry)
 
@@ -239,15 +232,11 @@ class _Point:
     """A point light; its strength is its intensity."""
 
     def __init__(self, mi: MitsubaModule, position: NDArray[np.float64], geometry: float) -> None:
-        import drjit as dr
-
         self._position, self._scale = mi.Point3f(position), dr.opaque(mi.Float, 1 / geometry)
         dr.make_opaque(self._position)
 
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
         """See `_Lamp.seen_from`."""
-        import drjit as dr
-
         to = self._position - point.p
         square = dr.squared_norm(to)
         level = dr.maximum(dr.dot(to, normal), 0.0) * dr.rsqrt(square) / square * self._scale
@@ -258,15 +247,11 @@ class _Beam:
     """Parallel light; its strength is the irradiance across the beam."""
 
     def __init__(self, mi: MitsubaModule, direction: NDArray[np.float64], geometry: float) -> None:
-        import drjit as dr
-
         self._towards, self._scale = mi.Vector3f(-direction), dr.opaque(mi.Float, 1 / geometry)
         dr.make_opaque(self._towards)
 
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
         """See `_Lamp.seen_from`."""
-        import drjit as dr
-
         level = dr.maximum(dr.dot(self._towards, normal), 0.0) * self._scale
         return level, level, point.spawn_ray(self._towards)
 

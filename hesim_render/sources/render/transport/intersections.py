@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, Point2, Point3, Ray, Vector3
 
 
 def to_ball(ray: Ray, middle: Point3, square: Float) -> Float:
     """Distance along a ray to a ball, m; negative or NaN where the ball lies behind the ray or is missed."""
-    import drjit as dr
-
     to = middle - ray.o
     along = dr.dot(to, ray.d)
     # compute the root without cancellation, and the other one from the product of both roots
@@ -31,7 +30,6 @@ def to_face(ray: Ray, rows: Sequence[tuple[Vector3, Float]]) -> tuple[Float, Poi
     ray : Ray3f.
     rows : rows of the map to u, v and height: three pairs of a vector and a number.
     """
-    import drjit as dr
     import mitsuba as mi
 
     (u_row, u_0), (v_row, v_0), (normal, height) = rows
@@ -44,8 +42,6 @@ def to_face(ray: Ray, rows: Sequence[tuple[Vector3, Float]]) -> tuple[Float, Poi
 
 def meets_ball(ray: Ray, length: Float, ball: tuple[Point3, Float]) -> Mask:
     """True where the first `length` metres of a ray meet a ball, given by its centre and squared radius."""
-    import drjit as dr
-
     middle, square = ball
     to = middle - ray.o
     along, far = dr.dot(to, ray.d), dr.squared_norm(to)

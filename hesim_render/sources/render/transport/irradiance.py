@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, MitsubaModule, Point2, Point3, Vector3
 
 #: Area over squared distance below which a rectangle counts as a point at its centre: the sum over edges loses its
@@ -24,8 +25,6 @@ class RectangleLight:
     """
 
     def __init__(self, mi: MitsubaModule, frame: NDArray[np.float64]) -> None:
-        import drjit as dr
-
         self._mi = mi
         vectors = [mi.Vector3f(frame[:3, k]) for k in range(4)]
         corners = [frame[:3, 3] + a * frame[:3, 0] + b * frame[:3, 1] for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
@@ -45,13 +44,7 @@ class RectangleLight:
         ----------
         point : Point3f per lane.
         normal : unit Vector3f per lane.
-
-        Returns
-        -------
-        Float per lane, sr.
         """
-        import drjit as dr
-
         mi = self._mi
         rays = [corner - point for corner in self._corners]
         total = outline_above_horizon(mi, rays, normal)
@@ -69,13 +62,7 @@ class RectangleLight:
         ----------
         point, normal : see `irradiance`.
         place : Point2f in [0, 1)², random numbers.
-
-        Returns
-        -------
-        The point, Point3f, and its contribution, Float, sr.
         """
-        import drjit as dr
-
         drawn = dr.fma(self._half_width, 2 * place.x - 1, dr.fma(self._half_height, 2 * place.y - 1, self._middle))
         to = drawn - point
         square = dr.squared_norm(to)
@@ -96,8 +83,6 @@ def outline_above_horizon(mi: MitsubaModule, rays: Sequence[Vector3], normal: Ve
     rays : from the point to each corner, in order.
     normal : unit Vector3f per lane.
     """
-    import drjit as dr
-
     heights = [dr.dot(ray, normal) for ray in rays]
     total = mi.Float(0.0)
     leaving, entering = dr.zeros(mi.Vector3f), dr.zeros(mi.Vector3f)
@@ -117,8 +102,6 @@ def outline_above_horizon(mi: MitsubaModule, rays: Sequence[Vector3], normal: Ve
 
 def _edge(first: Vector3, second: Vector3, normal: Vector3) -> Float:
     """γ (Γ · n) of one edge."""
-    import drjit as dr
-
     across = dr.cross(first, second)
     length = dr.norm(across)
     angle = dr.atan2(length, dr.dot(first, second))

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import (
     Float,
     Interaction,
@@ -56,8 +57,6 @@ class Fleet:
     def __init__(
         self, mi: MitsubaModule, forms: Sequence[SimpleForm], numbers: Sequence[int], tracks: Tracks, groups: int
     ) -> None:
-        import drjit as dr
-
         self._mi, self._tracks, self._numbers = mi, tracks, np.array(numbers, np.int64)
         heads: list[list[float]] = []
         balls: list[Sequence[float]] = []
@@ -114,8 +113,6 @@ class Fleet:
         group : UInt32, number of that group among all groups of the scene.
         met : Bool, True where the ray came through the box of any group.
         """
-        import drjit as dr
-
         mi = self._mi
         inverse = inverse_of(ray.d)
 
@@ -148,8 +145,6 @@ class Fleet:
 
     def blocks(self, ray: Ray, moment: Moment, active: Mask) -> tuple[Mask, Mask]:
         """True where a ray hits anything before its `maxt`; and True where it came through the box of any group."""
-        import drjit as dr
-
         mi = self._mi
         inverse = inverse_of(ray.d)
 
@@ -195,8 +190,6 @@ class Fleet:
         -------
         state, met : the final state; and Bool, True where any box was met.
         """
-        import drjit as dr
-
         mi = self._mi
 
         def bunch(number: UInt32, *state: Any) -> LoopState:
@@ -227,8 +220,6 @@ class Fleet:
 
     def _parts(self, k: UInt32) -> tuple[tuple[UInt32, UInt32], tuple[UInt32, UInt32]]:
         """First and last, exclusive, of the balls and of the faces of a group of the fleet."""
-        import drjit as dr
-
         _, first_ball, last_ball, _ = dr.gather(self._mi.Array4u, self._heads, 2 * k)
         first_face, last_face, _, _ = dr.gather(self._mi.Array4u, self._heads, 2 * k + 1)
         return (first_ball, last_ball), (first_face, last_face)
@@ -244,16 +235,12 @@ class Fleet:
         return local
 
     def _rows(self, face: UInt32) -> list[tuple[Vector3, Float]]:
-        import drjit as dr
-
         mi = self._mi
         rows = [dr.gather(mi.Vector4f, self._faces, 4 * face + k) for k in range(3)]
         return [(mi.Vector3f(row.x, row.y, row.z), row.w) for row in rows]
 
     def _hit(self, t: Float, is_hit: Mask, place: Point2, which: UInt32, ball: Mask) -> Interaction:
         """The hit record from which Mitsuba computes a surface interaction."""
-        import drjit as dr
-
         mi = self._mi
         hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(t))
         hit.valid, hit.t = is_hit, dr.select(is_hit, t, dr.inf)
@@ -277,8 +264,6 @@ class Fleet:
 
 def _number(mi: MitsubaModule, shape: MitsubaObject) -> int:
     """The number by which Dr.Jit identifies a shape."""
-    import drjit as dr
-
     number: UInt32 = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
     return int(number[0])
 

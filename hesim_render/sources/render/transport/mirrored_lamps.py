@@ -13,6 +13,7 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, MitsubaModule, MitsubaObject, Point2, Point3, Vector3
 from hesim_render.sources.render.scene.mitsuba_version import mesh_faces, mesh_vertices
 
@@ -44,8 +45,6 @@ class LampImages:
     """
 
     def __init__(self, mi: MitsubaModule, images: list[Image]) -> None:
-        import drjit as dr
-
         self._mi = mi
         largest = sorted(images, key=lambda image: -image[1])[:_MOST]
         self._images = [
@@ -86,8 +85,6 @@ class LampImages:
         upwards : unit Vector3f, on the visible side of the surface.
         active : lanes in use.
         """
-        import drjit as dr
-
         mi = self._mi
         cones = []
         for centre, square, normal, offset in self._images:
@@ -123,8 +120,6 @@ class Cones:
         ----------
         choice, place : random numbers in [0, 1) and [0, 1)².
         """
-        import drjit as dr
-
         mi = self._mi
         axis, width, before, drawn = mi.Vector3f(0, 0, 1), mi.Float(0.0), mi.Float(0.0), mi.Bool(False)
         for one, wide, chance in self._cones:
@@ -139,8 +134,6 @@ class Cones:
 
     def density(self, direction: Vector3) -> Float:
         """Density of the directions drawn from images, per steradian; its integral is `chance`."""
-        import drjit as dr
-
         total = self._mi.Float(0.0)
         for axis, width, chance in self._cones:
             inside = (chance > 0) & (1 - dr.dot(direction, axis) <= width)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import (
     Float,
     Interaction,
@@ -30,13 +31,12 @@ from hesim_render.core.device_types import (
     Vector3,
 )
 from hesim_render.core.errors import SpecError
-from hesim_render.sources.render.scene.builder import BuiltScene
+from hesim_render.sources.render.scene.builder import BuiltScene, NeedsExactMode, require_paths
 from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.closed_form import Part, surface_of
 from hesim_render.sources.render.transport.many_objects import Fleet
 from hesim_render.sources.render.transport.motion_bounds import stays_in
-from hesim_render.sources.render.transport.needs_exact import NeedsExactMode, require_paths
 from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows, inverse_of, meets_box
 
 #: Largest number of objects in closed form that are tested one by one; more are tested in a loop of one kernel.
@@ -201,8 +201,6 @@ class MovingScene:
         active : lanes to trace.
         flags : `RayFlags`, fields to compute; default all.
         """
-        import drjit as dr
-
         mi = self.mi
         flags = mi.RayFlags.All if flags is None else flags
         hit, face = self._resting.nearest(ray, coherent, active)
@@ -242,7 +240,6 @@ class MovingScene:
         """Distance to the nearest surface of all parts, m, infinite where there is none; and True where a box was
         met.
         """
-        import drjit as dr
 
         def visit(group: Group, own: DevicePose, local: Ray, near: Mask, state: LoopState) -> LoopState:
             local.maxt = dr.minimum(local.maxt, state[0])
@@ -303,8 +300,6 @@ class MovingScene:
         -------
         state, met : the final state; and Dr.Jit Bool, True where any box was met.
         """
-        import drjit as dr
-
         met = self.mi.Bool(False)
         inverse = inverse_of(ray.d)
         for number in self._single:

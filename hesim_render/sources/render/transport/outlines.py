@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, MitsubaModule, MitsubaObject, Point3, Vector3
 from hesim_render.sources.render.scene.mitsuba_version import mesh_faces, mesh_vertices
 from hesim_render.sources.render.transport.irradiance import outline_above_horizon
@@ -155,8 +156,6 @@ class Screen:
     """
 
     def __init__(self, mi: MitsubaModule, outlines: Sequence[Outline]) -> None:
-        import drjit as dr
-
         self._mi = mi
         self._sides = [each.one_sided for each in outlines]
         self._corners = [[mi.Point3f(corner) for corner in each.corners] for each in outlines]
@@ -176,8 +175,6 @@ class Screen:
         point, normal : of each lane, at rest with the part; unit normals.
         direction : unit Vector3f above the horizon of each lane.
         """
-        import drjit as dr
-
         mi = self._mi
         share, count = mi.Float(0.0), mi.Float(0.0)
         for corners, (plane, offset, margin), one_sided in zip(self._corners, self._planes, self._sides, strict=True):
@@ -225,10 +222,6 @@ def largest(parts: Sequence[Sequence[Outline]]) -> list[list[Outline]]:
 
 class OccludedSky:
     """What the outlines of a moving scene hide of a uniform sky.
-
-    Parameters
-    ----------
-    scene : the scene.
 
     Attributes
     ----------

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import (
     Bands,
     Float,
@@ -46,8 +47,6 @@ class PathIntegrator:
     """
 
     def __init__(self, scene: MovingScene, max_depth: int, roulette_depth: int, wavelengths: WavelengthSampler) -> None:
-        import drjit as dr
-
         self._scene, self._wavelengths = scene, wavelengths
         self._max_depth, self._roulette_depth = (
             depth if depth >= 0 else 1 << 30 for depth in (max_depth, roulette_depth)
@@ -66,8 +65,6 @@ class PathIntegrator:
         """Trace one ray per lane. Parameters and results as `DiffuseIntegrator.flux`, with one estimate in place of
         two.
         """
-        import drjit as dr
-
         ray.wavelengths = self._scene.mi.UnpolarizedSpectrum(*self._wavelengths.sample(filter_index, sampler.next_1d()))
         radiance, met = self.sample(sampler, ray, moment)
         # not dr.mean: it puts the number of lanes into the kernel, so that each new number would compile again
@@ -88,8 +85,6 @@ class PathIntegrator:
         radiance : Spectrum, W m⁻² sr⁻¹ nm⁻¹.
         met : Bool, True where any segment came through the box of a moving object.
         """
-        import drjit as dr
-
         mi, scene = self._scene.mi, self._scene
         context = mi.BSDFContext()
         depth, met = mi.UInt32(0), mi.Bool(False)
@@ -201,8 +196,6 @@ class PathIntegrator:
 
     def _near_lamps(self, ray: Ray) -> Mask:
         """True where a ray meets the box around a light."""
-        import drjit as dr
-
         inverse, near = inverse_of(ray.d), self._scene.mi.Bool(False)
         for box in self._lamps:
             near |= meets_box(ray, inverse, dr.inf, box)
@@ -222,7 +215,6 @@ def _redirected(
     """Weight of a surface sample if some samples are drawn from cones; writes the sampled direction into `chosen`
     lanes.
     """
-    import drjit as dr
     import mitsuba as mi
 
     direction, drawn = cones.sample(choice, place)
@@ -241,8 +233,6 @@ def _redirected(
 
 def power_heuristic(a: Float, b: Float) -> Float:
     """Power heuristic of exponent 2: the weight of the strategy with density `a`."""
-    import drjit as dr
-
     a, b = a * a, b * b
     share = a / (a + b)
     return dr.select(dr.isfinite(share), share, 0.0)

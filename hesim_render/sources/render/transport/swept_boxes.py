@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, Ray, UInt32, Vector3
 
 
@@ -35,8 +36,6 @@ class Moment:
 
     def local_us(self, track: UInt32) -> Float:
         """Time since the first keyframe of a track, µs, as `Tracks.pose` takes it."""
-        import drjit as dr
-
         kind = type(self.window)
         return dr.gather(type(self.times), self.times, self.window * self.tracks + kind(track)) + self.instant_us
 
@@ -46,7 +45,6 @@ class Moment:
 
     def box_and_mark(self, row: UInt32) -> tuple[tuple[Vector3, Vector3], Float]:
         """The box in a row, and the number that is stored beside its low corner."""
-        import drjit as dr
         import mitsuba as mi
 
         place = 2 * (self.bin * self.rows + type(self.bin)(row))
@@ -67,15 +65,11 @@ def box_rows(boxes: NDArray[np.float64]) -> NDArray[np.float32]:
 
 def inverse_of(direction: Vector3) -> Vector3:
     """1 / d of each coordinate for `meets_box`; kept finite, because 0 · ∞ is undefined."""
-    import drjit as dr
-
     return dr.rcp(dr.select(abs(direction) < 1e-30, 1e-30, direction))
 
 
 def meets_box(ray: Ray, inverse: Vector3, length: Float, box: tuple[Vector3, Vector3]) -> Mask:
     """Whether the first `length` metres of a ray meet a box; `inverse` is `inverse_of` its direction."""
-    import drjit as dr
-
     one, other = (box[0] - ray.o) * inverse, (box[1] - ray.o) * inverse
     # not dr.minimum and dr.maximum: their handling of NaN takes most of the time
     ordered = one < other

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Ray, UInt32
 from hesim_render.core.method_cache import method_cache
 from hesim_render.sensor.sensor import Sensor
@@ -141,8 +142,6 @@ class ChiefRays:
 
     def _seen(self, row: Float, col: Float, offset: tuple[Float, Float], now: Moment) -> tuple[Ray, Float]:
         """Rays from the camera in world space; and depth along the axis at distance 1."""
-        import drjit as dr
-
         types = jit()
         aperture = offset[0] + 0.5, offset[1] + 0.5
         origin, direction = self._rays.rays(row, col, aperture, None)
@@ -162,8 +161,6 @@ class ChiefRays:
         at : places and times.
         offset_px : place beside the pixels' centres, px, to the right and downwards.
         """
-        import drjit as dr
-
         mi, types = mitsuba(), jit()
         near = dr.opaque(types.Float, self.view.near_m)
         count = at.t_us.size
@@ -192,8 +189,6 @@ class ChiefRays:
 
     def _blocks(self, at: Placed, offset_px: tuple[float, float]) -> Iterator[tuple[slice, Ray, Float, Moment]]:
         """Rays block by block: which they are, the rays, their depth at distance 1, and their times."""
-        import drjit as dr
-
         types = jit()
         moments, share = self._moment(at.t_us)
         offset = dr.opaque(types.Float, offset_px[0]), dr.opaque(types.Float, offset_px[1])
@@ -218,8 +213,6 @@ class ChiefRays:
         [n, 4]: diffuse reflectance, darker where a surface is seen at a grazing angle. `CLEAR` where glass or metal has
         none, 1 for lamps, `sky_brightness` where nothing was met.
         """
-        import drjit as dr
-
         mi = mitsuba()
         values = np.empty((at.t_us.size, 4), np.float32)
         bands = mi.UnpolarizedSpectrum(*(dr.opaque(mi.Float, float(value)) for value in wavelengths_nm))
@@ -277,8 +270,6 @@ class ChiefRays:
         origin: NDArray[np.float64],
         usable: NDArray[np.bool_],
     ) -> NDArray[np.bool_]:
-        import drjit as dr
-
         mi, types = mitsuba(), jit()
         clear = np.zeros(usable.size, np.bool_)
         where = np.flatnonzero(usable)

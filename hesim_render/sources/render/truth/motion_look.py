@@ -95,10 +95,6 @@ def motion_look(scene: Scene, sensor: Sensor, t_us: float, duration_us: int) -> 
     t_us : time of the picture, within the run, µs.
     duration_us : length of the run, µs.
 
-    Returns
-    -------
-    Picture, trails and expected events.
-
     Raises
     ------
     RangeError

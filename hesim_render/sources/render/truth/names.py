@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject, UInt32
 from hesim_render.sources.render.scene.builder import BuiltScene
 from hesim_render.sources.render.transport.moving_scene import MovingScene
@@ -84,7 +85,6 @@ def _material_name(own: str, shape: str) -> str:
 
 def _number(pointer: MitsubaObject, thing: MitsubaObject) -> int:
     """The number by which Dr.Jit identifies an object of Mitsuba."""
-    import drjit as dr
     import mitsuba as mi
 
     number: UInt32 = dr.reinterpret_array(mi.UInt32, pointer(thing))
