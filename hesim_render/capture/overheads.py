@@ -22,7 +22,7 @@ _BENT_STEP_S, _BENT_STEP_PIXEL_S = 2.5e-3, 0.035e-6
 _FRAME_S, _FRAME_PIXEL_S = 2e-2, 60e-9
 #: Rays of an audit: a multiple of the run's own, and at most so many for pixels with a tick and for asynchronous ones,
 #: whose units have ten windows, or this part of the run's own; and its start, s.
-_AUDIT_RAYS, _MOST_TICK_RAYS, _MOST_ASYNCHRONOUS_RAYS, _AUDIT_PART, _AUDIT_S = 8.0, 8e6, 24e6, 0.125, 0.5
+_AUDIT_RAYS, _MOST_TICK_RAYS, _MOST_ASYNCHRONOUS_RAYS, _AUDIT_PART, _AUDIT_S = 8.0, 8e6, 24e6, 0.0625, 0.5
 
 
 def with_overheads(rays: Estimate, sensor: Sensor, demand: Demand, *, audited: bool, rests: bool) -> Estimate:
