@@ -9,7 +9,7 @@ from scipy.stats import chi2, norm
 from hesim_render.calibrate.evs import analysis, checks, defects, fit, goodness
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_likelihood, log_probability
-from hesim_render.calibrate.flicker import unsteady
+from hesim_render.calibrate.flicker import dynamics, unsteady
 from hesim_render.calibration.spec import Defect
 from hesim_render.core.errors import SpecError
 
@@ -163,6 +163,26 @@ def test_a_pixel_is_unsteady_beyond_a_tail_of_1e_6(more):
     few = np.zeros((20, 2))
     few[0] = 9, 10  # all events in one part
     assert unsteady(few, 400).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(("trials", "firing", "rate", "correlation", "usual"), [
+    (30, 0.37, 0.6, 0.93, 0.02), (45, 0.7, 0.3, 0.8, 0.05), (80, 0.2, 0.9, 0.985, 0.0),
+])  # fmt: skip
+def test_share_and_correlation_follow_from_the_moments_of_successive_counts(trials, firing, rate, correlation, usual):
+    """The moments of a chain of two states, summed trial by trial, as those of a wave of 4001 parts."""
+    i = np.arange(trials)
+    own = rate**2 * firing * (1 - firing)
+    within = own * (np.sum(correlation ** np.abs(i[:, None] - i)) - trials)
+    neighbour = own * np.sum(correlation ** (i[:, None] + trials - i))
+    mean = trials * (rate * firing + usual)
+    variance = mean * (1 - mean / trials) + within
+    wave = np.sqrt(2 * variance) * np.cos(np.arccos(neighbour / variance) * np.arange(4001) + 0.3)
+    steady = np.sqrt(mean) * np.where(np.arange(4001) % 2, 0.3, -0.3)
+    share, found = dynamics(mean + np.stack([wave, steady], axis=1), trials, usual)
+    assert share[0] == pytest.approx(firing, rel=0.02) and np.log(found[0]) == pytest.approx(
+        np.log(correlation), rel=0.05
+    )
+    assert (share[1], found[1]) == (1, 0)
 
 
 def static_of(lit, dark, signal, parts=None, trials=10_000):

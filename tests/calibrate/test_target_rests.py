@@ -6,6 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
 
 from hesim_render.calibrate.recordings import rests, target
 from hesim_render.calibrate.recordings.tally import GROUPS, STEPS, tally
@@ -103,6 +105,36 @@ def test_the_highest_level_of_noise_is_that_of_simulated_noise(cutoff_hz, drift,
         square = levels[-1] ** 2 - np.trapezoid(2 * levels * law, levels)
         assert mean == pytest.approx(values.mean(), rel=0.03)
         assert np.sqrt(square - mean**2) == pytest.approx(values.std(), rel=0.06)
+
+
+@pytest.mark.parametrize("drift", [0.0, 1.7, -2.3])
+def test_crossings_are_those_of_a_moving_level_summed_over_time(drift):
+    """Noise crosses a level that moves by its velocity against it: before, during and after a rest, each seen slowly.
+
+    Crossings downwards end what was above while the light rose. Slopes as fast as the noise, so that each part counts.
+    """
+    sigma, cutoff_hz, rest_s = 0.21, 29.0, 0.043
+    pole = 2 * np.pi * cutoff_hz / np.sqrt(np.sqrt(2) - 1)
+    ramps = rests.Ramps((0.7 * pole * sigma, 0.4 * pole * sigma), drift * sigma * pole / 50, rest_s)
+
+    def passing(velocity):
+        """Mean part of the noise's velocity above one, per second, in σ."""
+        return pole * quad(lambda v: max(v - velocity / pole, 0) * norm.pdf(v), -9, 9, points=[velocity / pole])[0]
+
+    def crossed(level, slope, velocity, seconds):
+        """In the time that the level moves away by a slope; noise of such a velocity reaches it."""
+        at = np.linspace(0, seconds, 20_001)
+        return passing(velocity) * np.trapezoid(np.interp(level + slope * at, rests._GRID, rests._RATE), at)
+
+    before, after = (slope / sigma for slope in ramps.slopes)
+    own, t = ramps.drift / sigma, np.array([0.3, 1.0]) * rest_s
+    for is_over in (False, True):
+        found = rests.highest(np.array(sigma), np.array(cutoff_hz), ramps, t, is_over)
+        for k, level in ((0, 55), (1, 55), (0, 70), (1, 85)):
+            u = rests._LEVELS[level]
+            crossings = crossed(u, before, before, 12 / before) + crossed(u, -own, -own, t[k])
+            crossings += is_over * crossed(u - own * t[k], after, after, 12 / after)
+            assert found[k, level] == pytest.approx(norm.cdf(u) * np.exp(-crossings), rel=2e-3)
 
 
 @pytest.mark.parametrize("name", ["low thresholds", "slow, no leak"])

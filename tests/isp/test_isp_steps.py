@@ -72,6 +72,19 @@ def test_each_hole_of_a_tile_that_is_not_square_gets_its_own_colour():
     np.testing.assert_allclose(found, mosaic_of(np.broadcast_to(colours, (*shape, 4)), filled), rtol=1e-6)
 
 
+def test_bad_pixels_of_a_tile_that_is_not_square_get_their_own_colour():
+    """Event pixels stay as they are, on the tile's diagonal too; every other cell has bad pixels."""
+    tile = np.array([(-1, 0, 2, 1), (2, 0, -1, 1), (1, 2, 0, -1)])
+    whole = mosaic_of(np.broadcast_to(np.array([3.0, 7.0, 11.0, 0.3], np.float32), (31, 45, 4)), tile)
+    bad = np.zeros(whole.shape, bool)
+    for number, (row, col) in enumerate(np.ndindex(tile.shape)):
+        bad[6 + row, 1 + 2 * number] = bad[13 + row, 20 + col] = True
+    assert {int(tile[r % 3, c % 4]) for r, c in np.argwhere(bad)} == {-1, 0, 1, 2}
+    found = fill.fill_pixels(np.where(bad, 99.0, whole).astype(np.float32), tile, bad)
+    events = tile[np.ix_(np.arange(31) % 3, np.arange(45) % 4)] < 0
+    np.testing.assert_allclose(found, np.where(events & bad, 99.0, whole), rtol=1e-6)
+
+
 @pytest.mark.parametrize(("size", "period", "margin"), [(13, 3, 8), (8, 4, 8), (5, 2, 4), (9, 5, 10)])
 def test_lines_beyond_the_sides_are_those_of_the_same_place_in_the_tile(size, period, margin):
     found, place = fill._kept_in_phase(size, period, margin), np.arange(-margin, size + margin)

@@ -340,6 +340,18 @@ def test_every_family_lowers_the_cost_within_its_constraints(family):
         assert np.abs(np.diff(curve)).max() / 5 < 0.022 if family != "thin_film" else True
 
 
+def test_slopes_above_the_largest_cost_their_square():
+    """Of 94 steps of 5 nm, 20 rise 1.5 times as fast as allowed and 7 fall 3 times as fast; others are as allowed."""
+    problem = Problem.__new__(Problem)
+    problem.spec = SimpleNamespace(slope_max_per_nm=0.002)
+    assert DESIGN_NM.size == 95 and np.all(np.diff(DESIGN_NM) == 5)
+    slopes = np.zeros(94)
+    slopes[3:23], slopes[40:47], slopes[60:75] = 0.003, -0.006, 0.00199
+    curve = 0.3 + np.append(0, np.cumsum(5 * slopes))
+    found = problem._steepness(jit().Float64(curve))[0]
+    assert found == pytest.approx(1000 * (20 * 0.5**2 + 7 * 2.0**2) / 94, rel=1e-9)
+
+
 def test_fresh_parameters_compile_nothing():
     """Numbers that change from step to step are data of the kernels, not parts of their code."""
     problem = Problem(DesignSpec.model_validate(SMALL))
