@@ -8,6 +8,7 @@ import pytest
 import hesim_render as hr
 from hesim_render.core.errors import RangeError
 from hesim_render.measure import edge_response
+from hesim_render.spectral.spectrum import illuminant
 from hesim_render.studies import demosaic_figures
 from hesim_render.studies.demosaic_figures import DARK, LIGHT, _figures, zipper
 
@@ -95,6 +96,20 @@ def test_zipper_counts_pixels_that_differ_from_their_true_likes():
     assert 100 / 49 <= found <= 900 / 49
     picture[4, 2] = true[4, 2] + [0, 2, 0]
     assert zipper(picture, true, every) == 0  # below the threshold
+
+
+def test_a_picture_with_noise_has_the_levels_of_the_chart(monkeypatch):
+    """Dark current of as many electrons as white: its mean is taken off, whatever the exposure and the gain are."""
+    monkeypatch.setattr(demosaic_figures, "_figures", lambda *_: {})
+    sensor = hr.load_sensor("reference-bayer", {"aps.dark_current_e_per_s": 4e5, "aps.exposure_us": 7_000})
+    figures, picture = demosaic_figures.demosaic_figures(
+        sensor, illuminant("D65"), np.eye(3), np.full(3, 2900.0), np.full(3, 2900.0), 7_000.0, 0.0, 1, 3
+    )
+    chart = DARK + (LIGHT - DARK) * demosaic_figures.chart()
+    inner = np.s_[20:-20, 20:-20]
+    # shot noise of 5700 electrons and less, 75 of 2900, over 80,000 pixels
+    assert picture[inner].mean() == pytest.approx(chart[inner].mean(), abs=1e-3)
+    assert 0.01 < figures["picture_error_simulated"] < 0.2
 
 
 def test_mosaics_cost_what_their_sampling_says():
