@@ -9,6 +9,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.specs.target import TargetSpec
 from hesim_render.spectral.spectrum import Spectrum
 from hesim_render.targets.build import build_target, placed_pieces
+from hesim_render.targets.piece import Picture, bent, picture_piece
 from hesim_render.targets.points import target_points
 
 TARGETS = [
@@ -181,6 +182,25 @@ def test_targets_are_bent_then_turned_then_moved():
         assert np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2].min() > 0
     with pytest.raises(SpecError, match=r"more than half a cylinder of this radius; it must be 0.09549 m or more"):
         build_target(target_of({**flat, "bend_radius_m": 0.09}))
+
+
+def test_places_on_a_bent_picture_are_those_of_the_flat_one():
+    """Unrolled, each strip lies between its lines, has its place in the picture, and together they are the whole."""
+    width, height, radius, step = 0.31, 0.17, 0.11, 0.023
+    flat = picture_piece("p", Picture(np.zeros((2, 3, 1), np.float32), "grey"), width, height, (0.2, 0.7, 0.1, 0.4))
+    found = bent(flat, radius, step)
+    x, y, z = found.vertices_m.T
+    along = radius * np.arctan2(x, radius - z)
+    np.testing.assert_allclose(found.uv[:, 0], 0.2 + 0.5 * (along / width + 0.5), atol=1e-9)
+    np.testing.assert_allclose(found.uv[:, 1], 0.1 + 0.3 * (y / height + 0.5), atol=1e-9)
+    strips = np.stack([along, y], axis=1)[found.faces.astype(int)]
+    one, other = strips[:, 1] - strips[:, 0], strips[:, 2] - strips[:, 0]
+    area = (one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]) / 2
+    assert area.min() > 0 and area.sum() == pytest.approx(width * height, rel=1e-9)
+    place = strips[..., 0] / step
+    assert np.all(np.ceil(place.max(axis=1) - 1e-9) - np.floor(place.min(axis=1) + 1e-9) == 1)
+    # 14 strips of two triangles, each cut into a part of 3 or 4 corners
+    assert len(strips) <= 14 * 2 * 2
 
 
 def test_a_zone_plate_has_the_stated_frequency():
