@@ -11,6 +11,7 @@ from hesim_render.benchmark.intensity import intensity_scores, leaky_sum
 from hesim_render.benchmark.optical_flow import flow_scores, of_pictures, plane_fit
 from hesim_render.benchmark.predictions import Predictions
 from hesim_render.core.errors import SpecError
+from hesim_render.measure.pictures import ssim
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
 
@@ -80,9 +81,11 @@ def test_flow_of_pictures_finds_a_shift(method):
 
 
 def test_a_leaky_sum_adds_steps_that_fade():
-    events = np.array([(1000, 1, 0, 1), (2000, 1, 0, 1), (3000, 0, 1, -1), (9000, 0, 0, 1)], EVENT_DTYPE)
-    found = leaky_sum(events, (2, 2), 5000, (0.2, 0.3), leak_us=10_000)
-    assert found == pytest.approx(np.array([[0, 0.2 * (np.exp(-0.4) + np.exp(-0.3))], [-0.3 * np.exp(-0.2), 0]]))
+    events = np.array([(1000, 1, 0, 1), (2000, 1, 0, 1), (3000, 3, 2, -1), (9000, 0, 0, 1)], EVENT_DTYPE)
+    found = leaky_sum(events, (3, 5), 5000, (0.2, 0.3), leak_us=10_000)
+    expected = np.zeros((3, 5))
+    expected[0, 1], expected[2, 3] = 0.2 * (np.exp(-0.4) + np.exp(-0.3)), -0.3 * np.exp(-0.2)
+    assert found == pytest.approx(expected)
     rng = np.random.default_rng(1)
     truth = rng.normal(0, 1, (20, 24))
     # scale and offset do not count; noise does: of variance 1 on 1, the fit leaves √(1 - ρ²) with ρ² = 1/2
@@ -90,6 +93,19 @@ def test_a_leaky_sum_adds_steps_that_fade():
     assert same["log_rmse"] < 1e-9 and same["correlation"] == pytest.approx(1) and same["ssim"] == pytest.approx(1)
     noisy = intensity_scores(truth + rng.normal(0, 1, truth.shape), truth)
     assert noisy["log_rmse"] == pytest.approx(np.sqrt(0.5), abs=0.08) and noisy["ssim"] < 0.8
+    # of what is finite in both, the residuals of a line and, over the truth's inner 99 %, SSIM
+    picture = 2.5 * truth + 0.7 + rng.normal(0, 0.8, truth.shape)
+    picture[3, 4], truth[7, 2] = np.nan, -np.inf
+    some = np.isfinite(picture) & np.isfinite(truth)
+    line = np.polyval(np.polyfit(picture[some], truth[some], 1), picture)
+    low, high = np.quantile(truth[some], [0.005, 0.995])
+    scores = intensity_scores(picture, truth)
+    assert scores["log_rmse"] == pytest.approx(np.sqrt(np.mean((line - truth)[some] ** 2)), rel=1e-9)
+    assert scores["correlation"] == pytest.approx(np.corrcoef(picture[some], truth[some])[0, 1])
+    one, other = (np.where(some, (values - low) / (high - low), 0) for values in (line, truth))
+    assert scores["ssim"] == pytest.approx(ssim(one, other))
+    assert "ssim" not in intensity_scores(picture[:10], truth[:10])
+    truth[7, 2] = 0.3
     flat = intensity_scores(np.zeros(truth.shape), truth)
     assert flat["log_rmse"] == pytest.approx(truth.std()) and np.isnan(flat["correlation"])
 
