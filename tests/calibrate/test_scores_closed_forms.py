@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from hesim_render.calibrate.evs import analysis, checks, defects, fit, goodness
+from hesim_render.calibrate.evs import analysis, checks, defects, fit, fitted, goodness
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_likelihood, log_probability
 from hesim_render.calibrate.flicker import dynamics, unsteady
@@ -151,6 +151,22 @@ def test_brightness_and_events_that_tell_nothing_are_refused(tmp_path):
             analysis._check_brightness(given, good, captures)
     with pytest.raises(SpecError, match="more than half of the trials"):
         analysis._check_brightness(static(5.0, 51), good, captures)
+
+
+def test_of_two_parameters_the_one_goes_without_which_the_fit_is_better(monkeypatch):
+    """Each is left out alone; one that is not free stays so."""
+    asked = []
+
+    def fit(cells, eta, theta_v, law, free):
+        asked.append(free)
+        return free, None, None
+
+    monkeypatch.setattr(fitted, "_fit", fit)
+    for likelihoods, better in (((-3.0, -5.0), True), ((-5.0, -3.0), False)):
+        values = iter(likelihoods)
+        monkeypatch.setattr(fitted, "_log_likelihood", lambda *_, values=values: next(values))
+        assert fitted._better_without(0, 2, None, ETA, 2.3, "sqrt", [True, False, True, True, True, True]) == better
+    assert asked == 2 * [[False, False, True, True, True, True], [True, False, False, True, True, True]]
 
 
 @pytest.mark.parametrize("more", [0.98, 1.02])

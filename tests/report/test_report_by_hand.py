@@ -261,9 +261,11 @@ def test_frames_name_the_lights_of_their_figures():
     """Signals of 4 to 99 % of 3000 DN: linearity takes 5 to 95 %, the gain up to 70 %, without unclear levels."""
     signal = np.array([120.0, 160.0, 900.0, 2090.0, 2120.0, 2840.0, 2870.0])
     clear = np.array([True, True, True, True, False, True, True])
-    pairs = SimpleNamespace(has_photons=True, spatial_lit=SimpleNamespace(photons=47.0))
+    pairs = SimpleNamespace(has_photons=True, spatial_lit=SimpleNamespace(photons=47.0), shape=(7, 11))
     result = SimpleNamespace(pairs=pairs, top_dn=3000.0, light=signal * 1.5, clear=clear, signal=signal)
-    lights = emva.FrameFigures(result, {}, []).lights
+    found = emva.FrameFigures(result, {}, [])
+    lights = found.lights
+    assert found.pixels == 77
     assert lights["K"] == "180 to 3140 photons" and lights["linearity_error_percent"] == "240 to 4260 photons"
     assert lights["full_well_e"] == "up to 4300 photons" and lights["prnu_percent"] == "47 photons, and dark"
 
