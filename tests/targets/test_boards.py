@@ -128,10 +128,12 @@ def test_points_are_those_of_the_drawn_boards():
     w, h = board.pattern_m
     expected = of_opencv * [1, -1, 1] + [-w / 2, h / 2, 0]
     np.testing.assert_allclose(target_points(board), expected, atol=1e-7)  # OpenCV has float32
-    grid = board_scene({"type": "aprilgrid", "rows": 2, "cols": 2, "tag_m": 0.05, "spacing": 0.2}).spec.target
-    corners = target_points(grid).reshape(4, 4, 3)
-    np.testing.assert_allclose(corners[0], [[-0.055, -0.055, 0], [-0.005, -0.055, 0], [-0.005, -0.005, 0],
-                                            [-0.055, -0.005, 0]], atol=1e-12)  # fmt: skip
+    grid = board_scene({"type": "aprilgrid", "rows": 2, "cols": 3, "tag_m": 0.05, "spacing": 0.2}).spec.target
+    corners = target_points(grid).reshape(6, 4, 3)
+    # the middle tag of the upper row is centred, 1.2 tags right of the first one; counter-clockwise from the lower left
+    for number, (x, y) in {0: (-0.085, -0.055), 4: (-0.025, 0.005)}.items():
+        expected = [[x, y, 0], [x + 0.05, y, 0], [x + 0.05, y + 0.05, 0], [x, y + 0.05, 0]]
+        np.testing.assert_allclose(corners[number], expected, atol=1e-12)
     with pytest.raises(SpecError, match="a target of type 'flat' has no calibration points"):
         target_points(hr.load_scene("flat-field").spec.target)
 

@@ -116,19 +116,26 @@ def test_slanted_edge_leans_clockwise_and_star_spokes_are_dark_from_the_x_axis()
     np.testing.assert_allclose(value, np.where(np.arange(8) % 2 == 0, 0.05, 0.8))
     outside, _ = value_at(star, np.array([0.095]), np.array([0.093]))
     assert outside == [0.8]
+    for width, height in ((0.26, 0.18), (0.18, 0.31)):
+        star = build_target(target_of({"type": "siemens-star", "spokes": 4, "width_m": width, "height_m": height}))
+        for radius, value in ((0.0899, np.where(np.arange(8) % 2 == 0, 0.05, 0.8)), (0.0901, 0.8)):
+            found, _ = value_at(star, radius * np.cos(angle), radius * np.sin(angle))
+            inside = (abs(radius * np.cos(angle)) < width / 2) & (abs(radius * np.sin(angle)) < height / 2)
+            np.testing.assert_allclose(found[inside], np.broadcast_to(value, 8)[inside])
 
 
 def test_squares_of_an_edge_field_are_turned_clockwise_about_the_middles_of_their_cells():
-    content = {"type": "edge-field", "rows": 2, "cols": 2, "angle_deg": [10, -20], "fill": 0.6, "height_m": 0.3}
+    content = {"type": "edge-field", "rows": 2, "cols": 3, "angle_deg": [10, -20], "fill": 0.6, "width_m": 0.36,
+               "height_m": 0.2}  # fmt: skip
     target = target_of(content)
-    x, y = np.random.default_rng(2).uniform(-0.15, 0.15, (2, 3000))
+    x, y = np.random.default_rng(2).uniform(-0.5, 0.5, (2, 3000)) * [[0.36], [0.2]]
     value, _ = value_at(build_target(target), x, y)
-    u, v = np.mod(x, 0.15) - 0.075, np.mod(y, 0.15) - 0.075
-    number = (y < 0) * 2 + (x > 0)
+    u, v = np.mod(x + 0.18, 0.12) - 0.06, np.mod(y, 0.1) - 0.05
+    number = (y < 0) * 3 + np.floor((x + 0.18) / 0.12)
     angle = np.radians(np.where(number % 2 == 0, 10, -20))
     # the turned axes of a square: its upright side leans to the right for a positive angle
     own_x, own_y = u * np.cos(angle) - v * np.sin(angle), u * np.sin(angle) + v * np.cos(angle)
-    dark = (abs(own_x) < 0.045) & (abs(own_y) < 0.045)
+    dark = (abs(own_x) < 0.03) & (abs(own_y) < 0.03)
     np.testing.assert_array_equal(value == 0.2, dark)
 
 
