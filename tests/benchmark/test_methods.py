@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
+from hesim_render.benchmark import optical_flow
 from hesim_render.benchmark.exposure_merge import flux_of, flux_scores, merged_exposures
 from hesim_render.benchmark.intensity import intensity_scores, leaky_sum
 from hesim_render.benchmark.optical_flow import flow_scores, of_pictures, plane_fit
@@ -49,6 +50,37 @@ def test_planes_through_the_events_of_an_edge_have_its_speed(angle_deg):
     shuffled = plane_fit(events_at(rng.uniform(0, 20_000, time.shape)), (rows, cols))
     assert np.isfinite(shuffled).all(axis=-1).mean() < 0.1
     assert np.isnan(plane_fit(events_at(time)[:0], (rows, cols))).all()
+
+
+def test_planes_through_a_part_of_a_window_are_those_of_least_squares():
+    """A bent front of which two of five pixels have no event, also at the sides: `lstsq` of each window by itself."""
+    rng, shape = np.random.default_rng(7), (17, 23)
+    y, x = np.indices(shape)
+    time = 400.0 * x - 250.0 * y + 9.0 * (x - 8) * (y - 5) + rng.normal(0, 120, shape)
+    time[rng.random(shape) < 0.4] = np.nan
+    time[9:, 14:] += rng.normal(0, 2500, (8, 9))  # no plane
+    time[:5, :6] = time[:5, :6] / 1e4  # faster than anything
+    velocity, count = optical_flow._planes(time)
+    seen = set()
+    for row, col in np.ndindex(shape):
+        window = np.s_[max(row - 2, 0) : row + 3, max(col - 2, 0) : col + 3]
+        there = np.isfinite(time[window])
+        t, n = time[window][there], there.sum()
+        design = np.column_stack([x[window][there], y[window][there], np.ones(n)])
+        found = velocity[row, col]
+        if n < optical_flow._FEWEST or np.isnan(time[row, col]) or np.linalg.matrix_rank(design) < 3:
+            assert np.isnan(found).all() and count[row, col] == 0
+            continue
+        (a, b, c), *_ = np.linalg.lstsq(design, t, rcond=None)
+        residual, spread = np.sum((t - design @ (a, b, c)) ** 2), np.sum((t - t.mean()) ** 2)
+        ratio, steep = np.sqrt(residual / spread) / optical_flow._MOST_RESIDUAL, np.hypot(a, b) * optical_flow._FASTEST
+        if ratio < 0.99 and steep > 1.01:
+            np.testing.assert_allclose(found, np.array([a, b]) / (a * a + b * b), rtol=1e-6)
+            assert count[row, col] == pytest.approx(n)
+        elif ratio > 1.01 or steep < 0.99:
+            assert np.isnan(found).all() and count[row, col] == 0
+        seen.add((bool(ratio < 1), bool(steep > 1)))
+    assert seen >= {(True, True), (False, True), (True, False)}
 
 
 def test_flow_is_measured_as_the_papers_have_it():
