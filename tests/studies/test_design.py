@@ -1,5 +1,6 @@
 """Design of filters: families against other programs, cost and gradients against central differences on float64."""
 
+import itertools
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -270,6 +271,32 @@ def test_shares_become_whole_pixels_that_lie_apart():
     letters[1, 2] = "w"
     held = spread_tile(letters, letters != "w", {"R": 5, "G": 5, "B": 5})
     assert held[1, 2] == "w" and "x" not in held
+
+
+def test_no_exchange_of_two_pixels_spreads_a_tile_more():
+    """Of a tile of 3 × 5 px with two that stay: repulsion of equal letters over 25 repetitions, pair by pair."""
+    letters = np.full((3, 5), "x")
+    letters[0, 3], letters[2, 1] = "w", "v"
+    free = [(i, j) for i, j in np.ndindex(3, 5) if letters[i, j] == "x"]
+    tile = spread_tile(letters, letters == "x", {"R": 4, "G": 6, "B": 3})
+    assert tile[0, 3] == "w" and tile[2, 1] == "v" and (tile == "G").sum() == 6
+
+    def energy(given):
+        total = 0.0
+        for a in free:
+            for b in free:
+                if a != b and given[a] == given[b]:
+                    for i in range(-2, 3):
+                        for j in range(-2, 3):
+                            square = (a[0] - b[0] + 3 * i) ** 2 + (a[1] - b[1] + 5 * j) ** 2
+                            total += np.exp(-square / (2 * 1.2**2))
+        return total
+
+    least = energy(tile)
+    for a, b in itertools.combinations(free, 2):
+        other = tile.copy()
+        other[a], other[b] = tile[b], tile[a]
+        assert energy(other) > least - 1e-3  # what lies farther than one repetition is not counted there
 
 
 def test_a_design_of_shares_ends_in_a_tile_of_its_own(tmp_path):
