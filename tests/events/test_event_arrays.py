@@ -105,6 +105,7 @@ def test_intervals_are_as_many_as_fit_but_for_rounding():
         rate = event_rate(NONE, 97.1, begin, end)
         np.testing.assert_allclose(rate.t_us, begin + 97.1 * np.arange(number))
         assert not rate.on_per_s.any() and np.isfinite(rate.on_per_s).all()
+        assert event_frames(NONE, SHAPE, 97.1, begin, end).shape == (number, *SHAPE)
 
 
 def test_no_events_give_empty_arrays_of_the_right_shape():

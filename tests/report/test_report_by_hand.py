@@ -617,6 +617,8 @@ def test_cycles_with_an_answer_are_counted_after_two_warm_ones():
             (2000, 2, 0, -1), (2539, 2, 1, 1), (2541, 0, 0, 1), (2541, 1, 1, -1)]  # fmt: skip
     bench, good = bench_of(rows, (40, 2560), [0, 0, 1, 1, 2, 5]), np.array([1, 1, 1, 0, 1, 1], bool)
     assert modulated._cycles(bench, modulation()) == (1040.0, 500.0, 3)
+    # a cycle of 300 Hz from 6706.67 to 10,040 µs, whose quotient in double precision is below 1
+    assert modulated._cycles(bench_of(rows, (40, 10_040), [0] * 6), modulation(hz=300.0))[2] == 1
     share = np.array([1, 1, 1, 0, 0, 1]) / 3
     expected = np.full(modulated.GROUPS + 1, share[good].mean())
     for group, left in ((0, [2, 4, 5]), (1, [0, 1, 4, 5]), (2, [0, 1, 2, 5]), (5, [0, 1, 2, 4])):
