@@ -174,6 +174,10 @@ def test_times_before_the_exposure_and_rows_that_begin_later():
     assert ratio[:, 1, 0] == pytest.approx(ratio[:, 0, 0])
     first = 10 / (5 + 5 * np.exp(on))
     assert ratio[:, 0, 0] == pytest.approx([first * np.exp(-on), first, first * np.exp(on)])
+    # the same 4000 µs later
+    events["t_us"] += 4000
+    later = sharp_over_blurred(events, (2, 1), [4000, 4100], 10, [3995, 4000, 4007], (on, off))
+    np.testing.assert_array_equal(later, ratio)
 
 
 def wave(t_us, rows=6, cols=40):

@@ -253,6 +253,21 @@ def test_local_tone_lowers_large_contrast_and_keeps_detail():
     np.testing.assert_allclose(tone.tone_local(image, compression=1.0), image, rtol=1e-5)
 
 
+def test_detail_and_contrast_have_factors_of_their_own():
+    """A chessboard of ± 0.05 doublings about 2⁻² is detail but for 1.5 %, var/(var + 0.16); its mean is the base."""
+    ripple = 0.05 * np.where(np.add.outer(np.arange(60), np.arange(84)) % 2, 1.0, -1.0)
+    image = (2.0 ** (ripple - 2))[..., None] * np.array([0.6, 1.1, 1.4])
+    image /= np.array([0.2126, 0.7152, 0.0722]) @ np.array([0.6, 1.1, 1.4])
+    found = np.log2(tone.tone_local(image.astype(np.float32), 0.7, 1.8, 9))[20:-20, 20:-20]
+    tint = np.log2(image / image[..., :1])[20:-20, 20:-20]
+    np.testing.assert_allclose(found - found[..., :1], tint, atol=1e-4)
+    luminance = np.log2(2.0**found @ np.array([0.2126, 0.7152, 0.0722]))
+    own = 0.05**2 / (0.05**2 + 0.16)
+    assert luminance.mean() == pytest.approx(0.7 * -2, abs=2e-3)
+    size = np.sum((luminance - luminance.mean()) * ripple[20:-20, 20:-20]) / np.sum(ripple[20:-20, 20:-20] ** 2)
+    assert size == pytest.approx(own * 0.7 + (1 - own) * 1.8, rel=0.01)
+
+
 def test_automatic_exposure_brings_highlights_to_the_level():
     image = RNG.uniform(0, 0.1, (200, 200, 3)).astype(np.float32)
     gain = tone.auto_gain(image, 99, 0.9)

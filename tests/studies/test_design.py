@@ -379,6 +379,18 @@ def test_slopes_above_the_largest_cost_their_square():
     assert found == pytest.approx(1000 * (20 * 0.5**2 + 7 * 2.0**2) / 94, rel=1e-9)
 
 
+def test_a_design_starts_with_its_depth_and_shares_as_parts_of_their_ranges():
+    """Depth 1.6 of 1 to 3.5 µm. Shares above the least one, 0.1, over the largest of them: 8, 5 and 3 of 16 pixels."""
+    problem = Problem.__new__(Problem)
+    problem.spec = SimpleNamespace(silicon_depth_um=(1.0, 3.5), tile_px=(4, 4), share_min=0.1)
+    problem._start_depth_um, problem.frames = 1.6, ["g", "r", "b"]
+    problem.tile = lambda rows, cols: (np.array(list("GGGGGGGGRRRRRBBB")).reshape(4, 4), np.ones((4, 4), bool))
+    problem.filter_set = SimpleNamespace(pixels={name.upper(): SimpleNamespace(filter=name) for name in "grb"})
+    depth, shares = problem._other_starts()
+    np.testing.assert_allclose(depth, [0.6 / 2.5])
+    np.testing.assert_allclose(shares, np.array([0.4, 5 / 16 - 0.1, 3 / 16 - 0.1]) / 0.4)
+
+
 def test_fresh_parameters_compile_nothing():
     """Numbers that change from step to step are data of the kernels, not parts of their code."""
     problem = Problem(DesignSpec.model_validate(SMALL))

@@ -146,6 +146,12 @@ def test_boards_that_cannot_be_drawn_are_refused(monkeypatch):
         with pytest.raises(SpecError) as caught:
             build_target(board_scene({**CHARUCO, **wrong}).spec.target)
         assert told in str(caught.value)
+    # 587 tags of the family: a grid of 2 × 3 ends with its last one, or one beyond; so does a board of 17 markers
+    grid = {"type": "aprilgrid", "rows": 2, "cols": 3, "tag_m": 0.05}
+    for board, last in ((grid, 581), ({"type": "charuco", "rows": 5, "cols": 7, "dictionary": "DICT_4X4_50"}, 33)):
+        build_target(board_scene({**board, "first_id": last}).spec.target)
+        with pytest.raises(SpecError, match=r"has \d+ markers, and this board needs number \d+"):
+            build_target(board_scene({**board, "first_id": last + 1}).spec.target)
     import sys
 
     monkeypatch.setitem(sys.modules, "cv2", None)

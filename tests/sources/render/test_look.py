@@ -63,6 +63,13 @@ def test_the_picture_of_a_motion_shows_every_few_pixels_of_the_region(monkeypatc
                 "horizontal_fov_deg": 2 * np.degrees(np.arctan(0.01 * 44 / 2 / 12))},
     )  # fmt: skip
     found = motion.motion_look(scene, hr.load_sensor("imx250").crop(44, 30), 20_000.0, 50_000)
+    # trails of points of the card, on a grid of the region at that time; 15 px in the run
+    at = np.array([np.interp(20_000, found.times_us, trail[:, 0]) for trail in found.trails])
+    assert at.size > 20 and np.all((at > 11.4) & (at < 28.1)) and at.min() < 13 and at.max() > 26.5
+    assert np.all((found.trails[..., 1] > 7.4) & (found.trails[..., 1] < 19.1))
+    apart = 44 / motion._POINTS
+    grid = (at - apart / 2) / apart
+    np.testing.assert_allclose(grid, np.rint(grid), atol=0.02)
     cols, rows = np.arange(stride // 2, 44, stride), np.arange(stride // 2, 30, stride)
     assert found.stride == stride and found.picture.shape == (rows.size, cols.size, 3)
     across, down = (cols > 11) & (cols < 28), (rows >= 8) & (rows < 19)
