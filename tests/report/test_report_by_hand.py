@@ -631,8 +631,9 @@ def test_cycles_with_an_answer_are_counted_after_two_warm_ones():
     # within 60 µs of 1040 and 1740 µs, of either polarity
     assert modulated._answered(bench, modulation(bursts), good)[0] == pytest.approx(np.mean([0.5, 0, 0, 0, 0]))
     short = bench_of(rows, (40, 1539), [0] * 6)
-    assert np.isnan(modulated._answered(short, modulation(), good)).all()
-    assert not modulated._counts(short, modulation(), good).any()
+    none = modulated._answered(short, modulation(), good), modulated._counts(short, modulation(), good)
+    assert none[0].shape == expected.shape and none[1].shape == (2, *expected.shape)
+    assert np.isnan(none[0]).all() and not none[1].any()
 
 
 def test_the_swing_that_half_answer_lies_between_those_around_it():
