@@ -80,6 +80,29 @@ def test_noise_of_emva_captures_in_electrons_with_its_error():
     assert less["value"] == pytest.approx(np.sqrt(8.9 - 1 / 12) / K)
 
 
+def test_noise_below_a_grey_value_is_that_of_the_long_series_less_what_else_it_holds():
+    """In squares: rows, columns and lines for the pixels' own noise, and the dark current of 13 ms for both."""
+    pairs = SimpleNamespace(spatial_dark=SimpleNamespace(exposure_s=0.013))
+    given = {"dark_noise_is_rounded_off": True, "pairs": pairs, "row": (0.011, 0.002), "col": (-0.004, 0.001),
+             "lines_dn2": 0.007}  # fmt: skip
+    series = SimpleNamespace(low=0.36, value=0.39, high=0.43)
+    current = 17.0 * K * 0.013
+    for tell, other in ((pairs_output._read_noise, 0.011 + 0.007 + current), (pairs_output._dark_noise, current)):
+        found = tell(calibration(rounded_noise=series, **given), K, RELATIVE)
+        low, value, high = (np.sqrt(v**2 - other) for v in (0.36, 0.39, 0.43))
+        error = (high - low) / (2 * Z)
+        check(found, value / K, value / K * np.hypot(error / value, RELATIVE), "e-")
+        expected = low / K * (1 - Z * RELATIVE), high / K * (1 + Z * RELATIVE)
+        assert found["interval_95"] == pytest.approx(expected, rel=1e-6) and found["value_dn"] == pytest.approx(value)
+    # known to a quarter; hidden by the rest, uncertain by more than a quarter, or never seen
+    for noise, limit in (((0.33, 0.43), None), ((0.29, 0.43), 0.43), ((0.35, 0.6), 0.49), (None, 0.49)):
+        series = None if noise is None else SimpleNamespace(low=noise[0], value=0.39, high=noise[1])
+        found = pairs_output._read_noise(calibration(rounded_noise=series, **given), K, RELATIVE)
+        assert (found["value"] is None) == (limit is not None)
+        if limit is not None:
+            assert found["upper_limit"] == pytest.approx(limit / K) and f"at most {limit:.2g} DN" in found["reason"]
+
+
 def test_efficiency_dark_current_and_full_well_of_emva_captures():
     value = 0.22 / K
     found = pairs_output._quantum_efficiency(calibration(), RELATIVE)
