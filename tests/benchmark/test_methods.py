@@ -172,6 +172,26 @@ def test_a_merge_of_exposures_has_the_least_error_on_still_light():
     assert np.isnan(flux_scores(merge, flux * 0, valid)["psnr_mu_db"])
 
 
+def test_flux_is_freed_of_the_dark_current_at_the_sensors_temperature():
+    """200 e⁻/s at 20 °C double twice up to 34 °C: frames without light have no flux, and the scatter that is stated."""
+    keys = {
+        "aps.dark_current_e_per_s": 200.0, "aps.dark_current_doubling_c": 7.0, "aps.dark_current_reference_c": 20.0,
+        "aps.temperature_c": 34.0, "aps.read_noise_e": 3.0, "aps.dsnu_e": 0.0,
+    }  # fmt: skip
+    sensor = hr.load_sensor("reference-mono", keys).crop(120, 70)
+    aps = sensor.spec.aps
+    mosaic = SimpleNamespace(black_level_dn=aps.black_level_dn, white_level_dn=2**aps.bit_depth - 1)
+    for exposure_us in (20_000, 90_000):
+        raw = sensor.aps.sample(np.zeros((70, 120), np.float32), exposure_us, 5, 0)
+        found = flux_of(raw, exposure_us, aps, mosaic)
+        seconds = exposure_us * 1e-6
+        variance = (3.0**2 + 800 * seconds) / seconds**2
+        assert abs(found.flux.mean()) < 5 * np.sqrt(variance * 1.3 / 8400)
+        np.testing.assert_allclose(found.dark_variance, variance, rtol=1e-9)
+        rounding = 1 / 12 / aps.system_gain_dn_per_e**2 / seconds**2
+        assert found.flux.var() == pytest.approx(variance + rounding, rel=0.08)
+
+
 def test_results_of_a_user_are_read_and_refused(tmp_path):
     folder = tmp_path / "deblur" / "clip"
     folder.mkdir(parents=True)
