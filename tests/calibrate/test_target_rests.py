@@ -137,6 +137,61 @@ def test_crossings_are_those_of_a_moving_level_summed_over_time(drift):
             assert found[k, level] == pytest.approx(norm.cdf(u) * np.exp(-crossings), rel=2e-3)
 
 
+def test_overshoots_weigh_noise_bandwidth_and_leak_by_both_rests(monkeypatch):
+    """The bandwidth is common: a value has the chance of its own rest, times that of its cut-off in both."""
+    rng, cuts, noises = np.random.default_rng(8), rests._CUTOFF_HZ.size, rests._NOISE.size
+    ramps = rests.Ramps((9.0, 7.0), 0.6, 0.02), rests.Ramps((5.0, 11.0), 0.0, 0.03)
+    both = [rests.Rest(each, np.array([0.01, 0.02]), np.ones(1), 9.0, 1.0, noisy) for each, noisy in
+            zip(ramps, (False, True), strict=True)]  # fmt: skip
+    shapes = (rests._LEAK.size, cuts, noises), (1, cuts, noises)
+    known = []
+    for k, shape in enumerate(shapes):
+        log = -0.5 * ((np.arange(cuts)[:, None] - 8 - 3 * k) / 3) ** 2 - 0.5 * ((np.arange(noises) - 20 + k) / 4) ** 2
+        log = log + 0.3 * rng.standard_normal(shape) - 0.2 * np.arange(shape[0])[:, None, None]
+        mean = (
+            0.4 * rests._NOISE * (1 + 0.03 * np.arange(cuts))[:, None] * (1 + 0.05 * np.arange(shape[0]))[:, None, None]
+        )
+        known.append((log, mean))
+    given = {id(rest): one for rest, one in zip(both, known, strict=True)}
+    asked = []
+
+    def highest(noise, cutoff_hz, ramps, times_s, is_over):
+        asked.append((noise, cutoff_hz, ramps, times_s.tolist(), is_over))
+        return norm.cdf(rests._LEVELS, 1.2, 0.8)[None]
+
+    monkeypatch.setattr(rests, "_posterior", lambda rest: given[id(rest)])
+    monkeypatch.setattr(rests, "highest", highest)
+    found = rests.overshoots(*both, 50)
+    of_cut = np.ones(cuts)
+    for log, _ in known:
+        of_cut *= np.exp(log).sum(axis=(0, 2))
+    of_cut /= of_cut.sum()
+    for one, rest, (log, mean), call in zip(found, both, known, asked, strict=True):
+        weight = np.exp(log) / np.exp(log).sum(axis=(0, 2))[:, None] * of_cut[:, None]
+        assert weight.sum() == pytest.approx(1)
+        order = np.argsort(mean, axis=None)
+        below = np.cumsum(weight.ravel()[order])
+        low, value, high = (float(np.interp(p, below, mean.ravel()[order])) for p in (0.025, 0.5, 0.975))
+        # twice the error of the law of late events besides
+        ends = value - np.hypot(value - low, 0.1 * value), value + np.hypot(high - value, 0.1 * value)
+        expected = (0.0, max(ends[1], 2 * value)) if rest.is_noisy else ends
+        assert (one.mean, one.low, one.high) == pytest.approx((value, *expected), rel=1e-9)
+        leaks = (np.ones(1) if rest.ramps.drift == 0 else rests._LEAK) * rest.ramps.drift
+        share = weight.sum(axis=(1, 2))
+        assert one.drift == pytest.approx(share @ leaks, rel=1e-9)
+        assert one.drift_error == pytest.approx(np.sqrt(share @ (leaks - share @ leaks) ** 2), abs=1e-12)
+        # the law of a likely value whose mean is the nearest one
+        likely = weight > 1e-3 * weight.max()
+        assert not likely.all()
+        leak, cut, noise = min(np.argwhere(likely), key=lambda k: abs(mean[tuple(k)] - value))
+        own = rests._NOISE[noise]
+        assert call[:2] == (own, rests._CUTOFF_HZ[cut]) and call[3:] == ([rest.ramps.rest_s], True)
+        assert call[2].drift == pytest.approx(leaks[leak])
+        law = norm.cdf(rests._LEVELS, 1.2, 0.8)
+        quantiles = own * np.interp((np.arange(50) + 0.5) / 50, law / law[-1], rests._LEVELS)
+        np.testing.assert_allclose(one.quantiles, quantiles - quantiles.mean() + value, rtol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["low thresholds", "slow, no leak"])
 def test_noise_at_the_rests_does_not_lower_the_thresholds(name):
     """Three recordings. Without the overshoots they are 2.3 and 3.9 % too low, four to twenty of their errors."""
