@@ -7,7 +7,7 @@ from rendering import D65_1000_LUX, make_scene, mono
 import hesim_render as hr
 from hesim_render.sources.render import look as framing_look
 from hesim_render.sources.render.camera import place_camera
-from hesim_render.sources.render.framing import posed_view
+from hesim_render.sources.render.framing import framing, posed_view
 from hesim_render.sources.render.look import _colours
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
@@ -97,3 +97,16 @@ def test_a_tall_picture_has_its_longer_side_and_both_outlines():
     white = np.argwhere(np.all(rgb == 255, axis=-1))
     np.testing.assert_allclose([white.min(axis=0), white.max(axis=0)],
                                [[7.5 * scale] * 2, [67.5 * scale, 47.5 * scale]], atol=2)  # fmt: skip
+
+
+@pytest.mark.parametrize("size_px", [(60, 40), (40, 66)])
+@pytest.mark.parametrize("size_m", [(0.3, 0.1), (0.2, 0.35)])
+def test_a_target_fills_its_part_of_the_side_that_it_fills_more(size_px, size_m):
+    """0.8 of one side; of the other by the ratio of both shapes."""
+    target = {"type": "flat", "width_m": size_m[0], "height_m": size_m[1]}
+    scene = make_scene(
+        target=target, light={"type": "uniform", "illuminance_lux": 9}, camera={"fit": "target", "fit_margin": 0.8}
+    )
+    found = framing(scene.spec, place_camera(scene.spec, mono(*size_px)))
+    ratio = (size_m[0] / size_px[0]) / (size_m[1] / size_px[1])
+    np.testing.assert_allclose(found.fills, [0.8 * min(1, ratio), 0.8 * min(1, 1 / ratio)], rtol=1e-6)
