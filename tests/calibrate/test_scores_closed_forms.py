@@ -54,8 +54,9 @@ def test_scores_are_slopes_of_the_likelihood(weighed):
 
 
 @pytest.mark.parametrize("weighed", [False, True])
-def test_the_covariance_is_that_of_the_scores_of_single_pixels(weighed):
-    """Bread, meat and bread: a loop over 40 pixels with two counts each, each pixel so many times."""
+def test_the_covariance_is_that_of_the_scores_of_single_pixels(weighed, monkeypatch):
+    """Bread, meat and bread: a loop over 40 pixels with two counts each, so many times each; 7 are summed at once."""
+    monkeypatch.setattr(fit, "_CHUNK", 7)
     rng = np.random.default_rng(2)
     cells, p = some_cells(rng)
     variance = 1.7 * cells.total * p * (1 - p) if weighed else None

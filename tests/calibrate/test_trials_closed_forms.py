@@ -338,6 +338,29 @@ def test_the_mismatch_of_both_polarities_is_weighed_by_their_covariance(on, off)
     assert (found.value, found.limit) == (0, max(on, off)) and np.isnan(found.error)
 
 
+def test_thresholds_of_pixels_are_the_means_of_what_their_counts_leave(monkeypatch):
+    """Of 11 pixels, four at once: mean and deviation over the grid, relative to the threshold of the fit."""
+    monkeypatch.setattr(analysis, "_CHUNK", 4)
+    monkeypatch.setattr(analysis, "TrialCounts", SimpleNamespace(of=lambda sets, polarity: sets))
+    rng, grids = np.random.default_rng(3), (np.array([0.1, 0.17, 0.26, 0.3]), np.array([0.2, 0.28, 0.33, 0.41]))
+    weights = rng.dirichlet(np.ones(4), 11)
+
+    def given(sets):
+        assert sets[0].tolist() == sets[1].tolist() and sets[0].size <= 4
+        return weights[sets[0]]
+
+    values = np.arange(9.0)
+    values[:2] = 0.21, 0.29
+    found_fit = SimpleNamespace(values=values, likelihood=SimpleNamespace(grids=grids), law_given=given)
+    trials = SimpleNamespace(calm=np.zeros((3, 11)), of=lambda some: some)
+    for polarity, theta, grid in ((1, 0.21, grids[0]), (-1, 0.29, grids[1])):
+        mean, spread = analysis._pixel_thresholds(found_fit, trials, trials, polarity)
+        expected = weights @ grid / theta
+        np.testing.assert_allclose(mean, expected, rtol=1e-6)
+        deviation = np.sqrt(np.sum(weights * (grid / theta - expected[:, None]) ** 2, axis=1))
+        np.testing.assert_allclose(spread, deviation, rtol=1e-4)
+
+
 def test_pixels_are_unlike_the_fit_by_any_test_that_few_fail(monkeypatch):
     """Chunks of three of the eight good pixels; a test that more than a quarter fails tells of the fit, and is left."""
     monkeypatch.setattr(defects, "_CHUNK", 3)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hesim_render.sources.render import timeline
 from hesim_render.sources.render.audit.audit import _rounded_down
 from hesim_render.sources.render.truth import imu
 
@@ -27,3 +28,20 @@ def test_a_sample_ends_with_the_run(monkeypatch, rate_hz, count):
 @pytest.mark.parametrize(("value", "shown"), [(0.29, 0.29), (0.2999, 0.29), (0.57, 0.57), (5.8, 5.8), (0.0346, 0.034)])
 def test_a_quality_is_rounded_down_to_two_digits(value, shown):
     assert _rounded_down(value) == pytest.approx(shown, rel=1e-9)
+
+
+def test_vertices_of_a_deforming_mesh_are_taken_some_at_a_time(monkeypatch):
+    """Eleven vertices, four at once: each once, in order."""
+    monkeypatch.setattr(timeline, "_CHUNK", 4)
+    vertices = np.arange(2 * 11 * 3.0).reshape(2, 11, 3)
+
+    def part(which):
+        return SimpleNamespace(at=lambda times: np.stack([vertices[0, which] + t for t in times]))
+
+    made = timeline.Timeline.__new__(timeline.Timeline)
+    made._deformations, made._corners = {"a": SimpleNamespace(vertices_m=vertices, part=part)}, {"b": vertices[0, :8]}
+    found = list(made._points("a", np.array([0.0, 5.0])))
+    assert [points.shape[1] for points in found] == [4, 4, 3]
+    np.testing.assert_array_equal(np.concatenate(found, axis=1), np.stack([vertices[0], vertices[0] + 5]))
+    (corners,) = made._points("b", np.zeros(1))
+    assert corners is made._corners["b"]
