@@ -275,6 +275,14 @@ def test_a_ratio_at_its_end_counts_as_known():
     assert covariance[0, 0] == pytest.approx(0.02**2 / 400, rel=0.3)
 
 
+def test_a_curve_may_be_as_steep_as_two_sizes_are_near():
+    """No jump of 0.2 is answered, and all of 0.2002 are: the width is less than their distance."""
+    sizes = np.array([0.12, 0.17, 0.2, 0.2002, 0.23, 0.3])
+    fit = s_curves._Fit(sizes, np.tile(12.0 * (sizes > 0.2001), (40, 1)), np.full(6, 12.0))
+    values, _ = fit.values()
+    assert 0.2 < values[0] < 0.2002 and np.exp(values[1]) < 1e-4
+
+
 def test_bad_input_is_one_clear_error(tmp_path, numpy_bench):
     _, _, report = numpy_bench
     captures = report.parent / "captures"
