@@ -45,3 +45,11 @@ def test_vertices_of_a_deforming_mesh_are_taken_some_at_a_time(monkeypatch):
     np.testing.assert_array_equal(np.concatenate(found, axis=1), np.stack([vertices[0], vertices[0] + 5]))
     (corners,) = made._points("b", np.zeros(1))
     assert corners is made._corners["b"]
+
+
+def test_a_camera_at_rest_is_sampled_at_the_edges_of_slices_alone():
+    made = timeline.Timeline.__new__(timeline.Timeline)
+    made._camera, made.edges_us = None, lambda begin, end: np.array([30.0, 70.0, 90.0])
+    assert made.sample_times_us(10.0, 100.0).tolist() == [30, 70, 90]
+    made._camera, made._camera_pieces = "moves", lambda a, b: {20.0: 2, 40.0: 4}.get(b - a, 1)
+    assert made.sample_times_us(10.0, 100.0).tolist() == [20, 30, 40, 50, 60, 70, 80, 90]
