@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from hesim_render.calibrate.asynchronous import fit as trials_fit
+from hesim_render.calibrate.asynchronous.likelihood import first_event
 from hesim_render.calibrate.evs import fit
 from hesim_render.calibrate.evs.cells import Cells
 
@@ -82,3 +83,35 @@ def test_a_start_has_the_thresholds_and_the_noise_of_exact_curves(monkeypatch, l
     # a mismatch is at most that of the pixels' own thresholds
     expected = [*theta, mismatch, 0.09, response, shot, read, wanted, 0.031]
     np.testing.assert_allclose(found, expected, rtol=2e-3)
+
+
+def test_a_pooled_curve_begins_below_two_fifths_and_ends_above_three():
+    """Shares of the calm trials of both pixels with an ON event in the first bin, by light; at least three steps."""
+    shares = {
+        5.0: [0.39, 0.45, 0.8, 0.9], 9.0: [0.42, 0.45, 0.8, 0.9], 20.0: [0.1, 0.3, 0.55, 0.59],
+        30.0: [0.1, 0.3, 0.59, 0.61], 50.0: [0.1, 0.9],
+    }  # fmt: skip
+    light = np.repeat(list(shares), [len(one) for one in shares.values()])
+    contrast = np.concatenate([0.05 + 0.1 * np.arange(len(one)) for one in shares.values()])
+    events = np.round(np.concatenate(list(shares.values()))[:, None] * [1000, 3000]).astype(int)
+    mixed = np.random.default_rng(2).permutation(light.size)
+    steps = SimpleNamespace(
+        signal_dn=light[mixed], contrast=contrast[mixed], calm=np.tile([1000, 3000], (light.size, 1)),
+        events=lambda polarity: np.stack([events, 0 * events + 7], axis=1)[mixed],
+    )  # fmt: skip
+    found = trials_fit._pooled_curves(steps, 1)
+    assert [(polarity, lit) for polarity, lit, _, _ in found] == [(1, 5.0), (1, 30.0)]
+    for _, lit, mean, _ in found:
+        # a law that rises in straight lines between the steps, whose first part lies at the first step
+        parts = np.diff(np.append(0.0, shares[lit])) / shares[lit][-1]
+        assert mean == pytest.approx(parts @ np.append(0.05, 0.1 * np.arange(1, 4)), rel=1e-9)
+
+
+def test_chances_of_a_step_up_are_those_of_a_mirrored_step_down():
+    """Whatever the noise at the reset leaves at the step: thresholds, step and leaks of both polarities exchanged."""
+    noise, edges = (np.full(1, 0.06), np.full(1, 0.045)), np.array([0.0, 2e-4, 3e-3])
+    for settle_s in (4e-4, 1.1e-3, 8e-3):
+        up = first_event(0.2, 0.11, np.full(1, 0.07), noise, 300.0, settle_s, edges, (0.4, 2.5))
+        down = first_event(0.11, 0.2, np.full(1, -0.07), noise, 300.0, settle_s, edges, (2.5, 0.4))
+        np.testing.assert_allclose(up, down[::-1], rtol=1e-9)
+        assert np.min(up) > 1e-6
