@@ -183,6 +183,24 @@ def test_patches_are_found_on_the_chart():
         chart.patch_means(picture, [(64, 64), (64, 764), (448, 764), (448, 64)])
 
 
+def test_patches_end_at_the_sides_of_the_image():
+    """2 × 3 patches, 40 px apart along rows and 50 along columns: each has half of the smaller distance, and a middle."""
+    image = np.random.default_rng(7).random((71, 101, 3))
+    half = round(chart._SHARE * 20)
+    whole = [(half, half), (half, half + 80), (half + 50, half + 80), (half + 50, half)]
+    rows, cols = 50 + 2 * half + 1, 80 + 2 * half + 1
+    found = chart.patch_means(image[:rows, :cols], whole, 2, 3)
+    for number, (row, col) in enumerate((r, c) for r in (half, half + 50) for c in (half, half + 40, half + 80)):
+        part = image[row - half : row + half + 1, col - half : col + half + 1]
+        np.testing.assert_allclose(found[number], part.mean(axis=(0, 1)), rtol=1e-12)
+    for smaller in (image[: rows - 1, :cols], image[:rows, : cols - 1]):
+        with pytest.raises(RangeError, match="would lie outside"):
+            chart.patch_means(smaller, whole, 2, 3)
+    for shift in ((-1, 0), (0, -1)):
+        with pytest.raises(RangeError, match="would lie outside"):
+            chart.patch_means(image, np.array(whole) + shift, 2, 3)
+
+
 def test_patch_centres_follow_perspective():
     """Lines stay lines: the diagonals of the chart meet in the centre of any of its views."""
     corners = np.array([(10, 20), (30, 200), (150, 180), (120, 40)], dtype=float)
