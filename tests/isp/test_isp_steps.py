@@ -184,7 +184,7 @@ def test_patches_are_found_on_the_chart():
 
 
 def test_patches_end_at_the_sides_of_the_image():
-    """2 × 3 patches, 40 px apart along rows and 50 along columns: each has half of the smaller distance, and a middle."""
+    """2 × 3 patches, 40 px apart along rows and 50 along columns: each takes half of the smaller distance."""
     image = np.random.default_rng(7).random((71, 101, 3))
     half = round(chart._SHARE * 20)
     whole = [(half, half), (half, half + 80), (half + 50, half + 80), (half + 50, half)]
