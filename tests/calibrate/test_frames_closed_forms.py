@@ -324,6 +324,23 @@ def test_variances_that_rounding_hides_fit_nothing():
     assert found.quantised_pixels == 150 and found.p_value == found.expected_chi2 == 1 and found.dof == 0
 
 
+def test_pixels_that_hardly_respond_are_below_a_fiftieth_of_their_like():
+    """Of a tile of 2 × 3 px whose positions have unlike rates: a fiftieth, ten errors, one dead neighbour; corners too."""
+    own = np.array([[900.0, 70.0, 5000.0], [300.0, 2500.0, 40.0]])
+    rate = np.tile(own, (8, 9))
+    error = 1e-3 * rate
+    dead = {(4, 6): 0.019, (9, 10): 0.019, (2, 20): 0.0, (6, 3): 0.015, (0, 0): 0.01, (1, 26): 0.0, (14, 12): 0.01}
+    for place, part in dead.items():
+        rate[place] *= part
+    rate[11, 5] *= 0.021  # alive
+    rate[8, 18], error[8, 18] = 10.0, 95.0  # of 900, known to 95: not ten errors below
+    rate[12, 24], error[12, 24] = 10.0, 85.0
+    rate[14, 25] = np.nan  # unknown
+    given = SimpleNamespace(rate_dn_per_s=rate, standard_error_dn_per_s=error)
+    found = frame_calibration._unresponsive(given, (2, 3))
+    assert {tuple(place) for place in np.argwhere(found).tolist()} == {*dead, (12, 24)}
+
+
 def test_sensors_without_event_pixels_have_no_signal_at_them():
     sensor = SimpleNamespace(tile_rows=["ab"], evs_grid=None)
     rate = SimpleNamespace(rate_dn_per_s=np.ones((4, 4)), standard_error_dn_per_s=np.ones((4, 4)))
