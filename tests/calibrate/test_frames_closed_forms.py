@@ -325,7 +325,7 @@ def test_variances_that_rounding_hides_fit_nothing():
 
 
 def test_pixels_that_hardly_respond_are_below_a_fiftieth_of_their_like():
-    """Of a tile of 2 × 3 px whose positions have unlike rates: a fiftieth, ten errors, one dead neighbour; corners too."""
+    """Of a tile of 2 × 3 px of unlike rates: a fiftieth, ten errors, one dead neighbour; in corners too."""
     own = np.array([[900.0, 70.0, 5000.0], [300.0, 2500.0, 40.0]])
     rate = np.tile(own, (8, 9))
     error = 1e-3 * rate
