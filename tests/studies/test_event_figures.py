@@ -18,7 +18,7 @@ def xyz_of(lightness, a, b):
 def test_what_a_tile_sees_is_what_its_pixels_would():
     """Three surfaces under four event pixels of three filters; thresholds differ by a quarter from pixel to pixel.
 
-    Means over 90,000 pixels a position: a probability of one half has an error of 0.002.
+    Means over 32,000 pixels a position: a probability of one half has an error of 0.003.
     """
     changes = {
         "evs.threshold_mismatch_rel": 0.25, "evs.contrast_threshold_on": 0.15, "evs.contrast_threshold_off": 0.27,
@@ -30,7 +30,7 @@ def test_what_a_tile_sees_is_what_its_pixels_would():
     lab = np.array([[40.0, 30.0, -20.0], [44.0, -10.0, 15.0], [47.0, 5.0, -12.0]])
     samples = SimpleNamespace(xyz=xyz_of(*lab.T), white_xyz=np.array([0.9, 1.0, 1.1]))
     found = tile_event_figures(sensor, filters, white, channels, samples)
-    part, tile = sensor.crop(1200, 1200), sensor.spec.tile_rows
+    part, tile = sensor.crop(720, 720), sensor.spec.tile_rows
     own = [filters.index(sensor.spec.pixels[tile[i][j]].filter) for i, j in sensor.spec.positions("evs")]
     where = part.layout.evs_position
     electrons = (white * channels * sensor.spec.evs.window_us * 1e-6)[:, own][:, where]
@@ -40,10 +40,10 @@ def test_what_a_tile_sees_is_what_its_pixels_would():
         any_of = [np.mean((on + off)[where == k]) for k in range(4)]
         seen[a, b] = 1 - np.prod(1 - np.array(any_of))
     assert 0.04 < min(seen.values()) < 0.1 and 0.3 < max(seen.values()) < 0.5
-    assert found["event_seen"] == pytest.approx(np.mean(list(seen.values())), abs=2e-3)
+    assert found["event_seen"] == pytest.approx(np.mean(list(seen.values())), abs=3e-3)
     # surfaces 0 and 1 differ by 4 in lightness and by more than 20 altogether, 0 and 2 by 7, 1 and 2 by 3 and more
     pairs = [(0, 1), (1, 0), (1, 2), (2, 1)]
-    assert found["event_seen_isoluminant"] == pytest.approx(np.mean([seen[pair] for pair in pairs]), abs=2e-3)
+    assert found["event_seen_isoluminant"] == pytest.approx(np.mean([seen[pair] for pair in pairs]), abs=3e-3)
     one = SimpleNamespace(xyz=samples.xyz[:1], white_xyz=samples.white_xyz)
     alone = tile_event_figures(sensor, filters, white, channels[:1], one)
     assert alone["event_seen"] is None and alone["event_seen_isoluminant"] is None
