@@ -95,6 +95,12 @@ def test_groups_of_brightness_hold_pixels_and_events():
     assert np.all(np.diff(wide) >= 0) and sums[:-1].min() >= 60 and sums[-1] >= 100
 
 
+def test_a_goodness_without_degrees_of_freedom_says_nothing():
+    for dof, per_dof, chance in ((9, 14.4 / 9, chi2.sf(14.4, 9)), (0, 1.0, 1.0), (-3, 1.0, 1.0)):
+        found = goodness.Goodness(14.4, dof)
+        assert (found.per_dof, found.p_value) == pytest.approx((per_dof, chance))
+
+
 def one_fit(**given):
     base = {
         "values": np.array([0.2, 0.9, 0.1, 0.0, 0.05, 0.0]), "free": (True, True, True, False, True, False),
