@@ -14,6 +14,7 @@ from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal
 from hesim_render.calibrate.asynchronous import likelihood
 from hesim_render.calibrate.asynchronous import output as trials_output
+from hesim_render.calibration import sensor_values
 from hesim_render.core.errors import SpecError
 
 #: Half of an interval of 95 % of a normal law, errors.
@@ -403,3 +404,25 @@ def test_captures_are_refused_from_their_limits_on(part, is_refused):
         pairs_required.require_steady_light, pairs, curve, light, 2 * light * off, np.array([1, 1, 1, 1, 0], bool)
     )
     assert refused(act, "this pair is 2 % off") is is_refused
+
+
+def test_the_asymmetry_is_that_of_static_counts_or_of_steps_whichever_is_better_known():
+    """The error of (θ₋ − θ₊)/(θ₋ + θ₊) by central differences in both thresholds."""
+
+    def of(value, error=None):
+        return SimpleNamespace(value=value, error=error)
+
+    def ratio(on, off):
+        return (off - on) / (off + on)
+
+    on, off = of(0.2, 0.004), of(0.27, 0.011)
+    h = 1e-6
+    slopes = [(ratio(0.2 + a, 0.27 + b) - ratio(0.2 - a, 0.27 - b)) / (2 * h) for a, b in ((h, 0), (0, h))]
+    error = np.hypot(slopes[0] * 0.004, slopes[1] * 0.011)
+    for part, expected in ((0.98, 0.11), (1.02, ratio(0.2, 0.27))):
+        given = SimpleNamespace(asymmetry=of(0.11, part * error), theta_on=on, theta_off=off)
+        assert sensor_values._asymmetry(given) == pytest.approx(expected)
+    unknown = SimpleNamespace(asymmetry=of(None), theta_on=on, theta_off=off)
+    assert sensor_values._asymmetry(unknown) == pytest.approx(ratio(0.2, 0.27))
+    for static, expected in ((of(0.11, 9.0), 0.11), (of(None), 0.0)):
+        assert sensor_values._asymmetry(SimpleNamespace(asymmetry=static, theta_on=of(None), theta_off=off)) == expected
