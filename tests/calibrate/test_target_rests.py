@@ -137,6 +137,36 @@ def test_crossings_are_those_of_a_moving_level_summed_over_time(drift):
             assert found[k, level] == pytest.approx(norm.cdf(u) * np.exp(-crossings), rel=2e-3)
 
 
+@pytest.mark.parametrize("is_noisy", [False, True])
+@pytest.mark.parametrize("drift", [0.0, 0.7])
+def test_late_events_are_poisson_numbers_of_the_rise_of_the_highest_level(monkeypatch, is_noisy, drift):
+    """With their scatter; of noisy rests the sum alone. The leak has a normal law of its logarithm."""
+
+    def highest(noise, cutoff_hz, ramps, times_s, is_over):
+        shift = 0.3 * np.log(cutoff_hz)[..., None, None] + ramps.drift + 40 * np.asarray(times_s)[:, None] + is_over
+        return norm.cdf(rests._LEVELS - shift + 0.1 * np.asarray(noise)[..., None, None])
+
+    monkeypatch.setattr(rests, "highest", highest)
+    edges, late = np.array([0.004, 0.011, 0.02]), np.array([70.0, 40.0])
+    rest = rests.Rest(rests.Ramps((9.0, 7.0), drift, 0.02), edges, late, 900.0, 1.7, is_noisy)
+    log, mean = rests._posterior(rest)
+    leaks = rests._LEAK if drift else np.ones(1)
+    assert log.shape == mean.shape == (leaks.size, rests._CUTOFF_HZ.size, rests._NOISE.size)
+    for a, b, c in ((0, 0, 0), (leaks.size - 1, 7, 30), (leaks.size // 2, 19, 12)):
+        noise, cut = rests._NOISE[c], rests._CUTOFF_HZ[b]
+        levels = []
+        for t, over in ((edges[0], False), (edges[1], False), (edges[2], True)):
+            law = norm(0.3 * np.log(cut) + leaks[a] * drift + 40 * t + over - 0.1 * noise)
+            levels.append(noise * (8 - quad(law.cdf, -5, 8)[0]))  # the mean of a law, from its top
+        expected = np.maximum(900 * np.diff(levels), 1e-9)
+        seen = late
+        if is_noisy:
+            expected, seen = expected.sum(keepdims=True), late.sum(keepdims=True)
+        chance = np.sum(seen * np.log(expected) - expected) / 1.7 - 0.5 * (np.log(leaks[a]) / 0.6) ** 2
+        assert mean[a, b, c] == pytest.approx(levels[-1], rel=1e-3)
+        assert log[a, b, c] == pytest.approx(chance, rel=2e-3)
+
+
 def test_overshoots_weigh_noise_bandwidth_and_leak_by_both_rests(monkeypatch):
     """The bandwidth is common: a value has the chance of its own rest, times that of its cut-off in both."""
     rng, cuts, noises = np.random.default_rng(8), rests._CUTOFF_HZ.size, rests._NOISE.size
