@@ -43,8 +43,9 @@ def flux_of(raw: NDArray, exposure_us: float, aps: ApsSpec, mosaic: Mosaic) -> E
     aps, mosaic : gain and noise; black level and white level.
     """
     seconds = exposure_us * 1e-6
-    electrons = (raw.astype(np.float64) - mosaic.black_level_dn) / aps.system_gain_dn_per_e
-    variance = max(aps.read_noise_e**2 + aps.dark_current_e_per_s * seconds, 1e-12)
+    dark_e = aps.dark_current_now_e_per_s * seconds
+    electrons = (raw.astype(np.float64) - mosaic.black_level_dn) / aps.system_gain_dn_per_e - dark_e
+    variance = max(aps.read_noise_e**2 + dark_e, 1e-12)
     top = mosaic.black_level_dn + _SATURATED * (mosaic.white_level_dn - mosaic.black_level_dn)
     return ExposureFlux(electrons / seconds, np.where(raw >= top, np.inf, variance / seconds**2), seconds)
 

@@ -29,7 +29,8 @@ def _boulder(rng: np.random.Generator) -> Faces:
     for _ in range(6):
         way = rng.normal(size=3)
         radius += rng.uniform(0.03, 0.12) * np.sin(points @ way * rng.uniform(1, 4) + rng.uniform(0, 2 * np.pi))
-    return (points * radius[..., None]).reshape(-1, 3), _sheet(_RINGS, _ROUND)
+    # rows run down the y axis, so that the sheet's own triangles look inwards, and glass would be air in glass
+    return (points * radius[..., None]).reshape(-1, 3), _sheet(_RINGS, _ROUND)[:, ::-1]
 
 
 def _star(rng: np.random.Generator) -> Faces:

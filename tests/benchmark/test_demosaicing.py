@@ -90,6 +90,25 @@ def test_channels_are_developed_as_a_mosaic_of_them_is(clip):
         )
 
 
+def test_a_tent_reaches_over_one_tile_in_each_direction():
+    """Of a tile of 3 × 4 px with a gap: each missing value by the weights (1 - |i|/3)(1 - |j|/4), summed by hand."""
+    tile = np.array([[0, 1, 2, -1], [2, 0, 0, 1], [1, 2, -1, 0]])
+    raw = np.random.default_rng(6).uniform(20, 900, (14, 19))
+    found = bilinear(raw, tile)
+    assert found.shape == (14, 19, 3)
+    for row, col in ((0, 0), (7, 10), (8, 3), (13, 18), (5, 17)):
+        for channel in range(3):
+            weights, values = [], []
+            for i in range(max(row - 2, 0), min(row + 3, 14)):
+                for j in range(max(col - 3, 0), min(col + 4, 19)):
+                    if tile[i % 3, j % 4] == channel:
+                        weights.append((1 - abs(i - row) / 3) * (1 - abs(j - col) / 4))
+                        values.append(raw[i, j])
+            is_own = tile[row % 3, col % 4] == channel
+            expected = raw[row, col] if is_own else np.average(values, weights=weights)
+            assert found[row, col, channel] == pytest.approx(expected, rel=1e-12)
+
+
 def test_bilinear_is_the_mean_of_the_nearest_samples():
     rng = np.random.default_rng(1)
     raw = rng.uniform(0, 100, (12, 12))

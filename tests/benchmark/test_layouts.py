@@ -104,7 +104,10 @@ def test_efnet_has_images_voxels_and_events(built, clip, tmp_path):
             end = frame.exposure_start_us + frame.exposure_us
             middle = end - frame.exposure_us // 2
             inside = (expected[2] > middle) & (expected[2] <= end)
-            assert voxel[5].sum() == (2 * expected[3][inside].astype(int) - 1).sum()
+            wanted = np.zeros((16, 24))
+            np.add.at(wanted, (expected[1][inside], expected[0][inside]), 2 * expected[3][inside].astype(int) - 1)
+            np.testing.assert_array_equal(voxel[5], wanted)
+            assert file[f"images/image{key}"].attrs["timestamp"] == voxel.attrs["timestamp"] == end / 1e6
             assert file[f"images/image{key}"].attrs["event_idx"] == (expected[2] <= end).sum()
 
 
@@ -161,6 +164,21 @@ def test_pictures_are_srgb_of_the_exposure_of_the_first():
     dark = layouts._Clip.__new__(layouts._Clip)
     dark.development, dark._gain = SimpleNamespace(linear=lambda number: 0 * light[number]), None
     assert dark.picture(2).max() == 0
+
+
+def test_times_and_pairs_are_those_of_the_middles_of_exposures():
+    """A sharp image belongs to a frame if it is at most a quarter of the exposure from its middle."""
+    frames = [SimpleNamespace(exposure_start_us=k, exposure_us=n, raw=k) for k, n in ((500, 800), (9_000, 400))]
+    made = layouts._Clip.__new__(layouts._Clip)
+    made.clip = SimpleNamespace(sharp=None, recording=SimpleNamespace(frames=frames))
+    assert [(t, raw()) for t, raw in made.sequence()] == [(900, 500), (9_200, 9_000)] and made.pairs() == []
+    for off, numbers in ((200, [0]), (-200, [0]), (201, []), (-201, []), (100, [0, 1])):
+        times = np.array([900.0 + off, 9_200 - off])
+        made.clip.sharp = SimpleNamespace(
+            time_us=times, nearest=lambda t, times=times: int(np.argmin(np.abs(times - t))), raw_dn=lambda k: -k
+        )
+        assert made.pairs() == [(frames[k], k) for k in numbers]
+        assert [(t, raw()) for t, raw in made.sequence()] == [(times[0], 0), (times[1], -1)]
 
 
 # ---- voxels -------------------------------------------------------------------------------------------

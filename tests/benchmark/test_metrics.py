@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from skimage.color import deltaE_ciede2000, rgb2lab
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from hesim_render.benchmark import metrics
 from hesim_render.benchmark.event_filters import background_activity, nearest_neighbour
 from hesim_render.benchmark.intensity import sharp_over_blurred
 from hesim_render.benchmark.metrics import chamfer, count_error, denoising_scores, rate_error, rate_maps
@@ -76,6 +77,17 @@ def cloud(rng, count, rows=9, cols=11, until=20_000):
     events["x"], events["y"] = rng.integers(0, cols, count), rng.integers(0, rows, count)
     events["polarity"] = rng.choice([-1, 1], count)
     return events
+
+
+def test_of_too_many_events_every_kth_of_a_polarity_counts(monkeypatch):
+    """Of 41, 40 and fewer at most 20 events: every third, every second, all."""
+    monkeypatch.setattr(metrics, "MOST_POINTS", 20)
+    a, b = cloud(np.random.default_rng(8), 61), cloud(np.random.default_rng(9), 58)
+    a["polarity"], b["polarity"] = np.where(np.arange(61) < 41, 1, -1), np.where(np.arange(58) < 40, 1, -1)
+    thinned = np.concatenate([a[:41:3], a[41:]]), np.concatenate([b[:40:2], b[40:]])
+    found = chamfer(a, b)
+    monkeypatch.undo()
+    assert found == chamfer(*thinned) != chamfer(a, b)
 
 
 def test_chamfer_distance_is_that_of_all_pairs():
@@ -162,6 +174,10 @@ def test_times_before_the_exposure_and_rows_that_begin_later():
     assert ratio[:, 1, 0] == pytest.approx(ratio[:, 0, 0])
     first = 10 / (5 + 5 * np.exp(on))
     assert ratio[:, 0, 0] == pytest.approx([first * np.exp(-on), first, first * np.exp(on)])
+    # the same 4000 µs later
+    events["t_us"] += 4000
+    later = sharp_over_blurred(events, (2, 1), [4000, 4100], 10, [3995, 4000, 4007], (on, off))
+    np.testing.assert_array_equal(later, ratio)
 
 
 def wave(t_us, rows=6, cols=40):

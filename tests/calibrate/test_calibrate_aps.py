@@ -1,5 +1,7 @@
 """APS calibration against an independent generator and closed forms."""
 
+import re
+
 import capture_sets
 import numpy as np
 import pytest
@@ -68,6 +70,15 @@ def test_fixed_maps_in_the_gauge(calibrated):
     hot = known["hot"]
     assert np.abs(maps["n_dp"][hot] / known["n_dp"][hot] - 1).max() < 0.5
     assert np.std(maps["n_dp"][~hot] - known["n_dp"][~hot]) < 25
+
+
+def test_a_full_well_that_no_exposure_reaches_has_a_least_value(tmp_path):
+    """3200 electrons at most, 864 of 1023 DN."""
+    capture_sets.write_frames(tmp_path / "set", size=(40, 56), frames=16)
+    calibrate_aps(tmp_path / "set", tmp_path / "c.yaml")
+    well = read_calibration(tmp_path / "c.yaml")["aps"]["full_well_e"]
+    least = re.search(r"no exposure saturates: it is at least (\d+) e-", well["reason"])
+    assert well["value"] is None and int(least[1]) == pytest.approx(3200, rel=0.03)
 
 
 def test_composite_has_the_error_it_states(calibrated):

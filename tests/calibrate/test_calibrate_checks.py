@@ -187,6 +187,7 @@ def test_groups_of_like_pixels_by_hand(pixels, events, each):
     group = event_goodness._groups(np.arange(pixels)[::-1], np.full(pixels, events))
     assert np.bincount(group).tolist() == [each] * (pixels // each)
     # a scatter is that of 100 events: by the hundred of the sum in which a group ends, and the rest joins the last
+    assert event_goodness._wider(np.array([50.0, 50, 100, 100, 100])).tolist() == [0, 0, 1, 2, 2]
     assert event_goodness._wider(np.full(7, 40.0)).tolist() == [0, 0, 1, 1, 1, 1, 1]
     assert event_goodness._wider(np.full(12, 40.0)).tolist() == [0, 0, 1, 1, 1, 2, 2, 3, 3, 3, 3, 3]
 

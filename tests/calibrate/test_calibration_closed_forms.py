@@ -490,6 +490,26 @@ def test_asymmetry_is_kept_from_a_likelihood_ratio_of_1e_3_on(gain, kept):
         assert fit.values[4] == pytest.approx(rho, rel=0.02)
 
 
+def test_errors_of_a_poor_fit_are_those_of_the_scatter_about_it(monkeypatch):
+    """From twice the expected χ² on, all variances are so many times as large; below it they stay."""
+    rng, trials, shape = np.random.default_rng(4), 3000, (24, 40)
+    signal = np.linspace(0, 220, 960).reshape(shape)
+    y = 0.02 * signal
+    u = (0.03 * signal + 2.2) / np.sqrt(2 * (1 + y * y))
+    on, off = (rng.binomial(trials, ndtr(-u)) for _ in range(2))
+    good = np.ones(shape, bool)
+    static = StaticCapture(signal, on, off, None, None, trials, (1, 1))
+    pixels = pool_events(static, good, PixelThresholds.unknown(shape, 0.0))
+    start = from_natural(np.array([0.03, 2.2, 0.02, 0.0, 0.0, 0.0]))
+    found = {}
+    for per_dof in (1.0, 1.97, 2.03, 5.0):
+        monkeypatch.setattr(fitted_events, "goodness", lambda *_, each=per_dof: event_goodness.Goodness(7 * each, 7))
+        found[per_dof] = fit_events(pixels, 1.0, "linear", start).covariance
+    assert found[1.0][0, 0] > 0
+    for per_dof, factor in ((1.97, 1.0), (2.03, 2.03), (5.0, 5.0)):
+        np.testing.assert_allclose(found[per_dof], factor * found[1.0], rtol=1e-9, atol=0)
+
+
 def test_intervals_of_a_jackknife_are_as_wide_as_students_law_asks():
     """Tables of t at 97.5 %: 2.2622 with 9 degrees of freedom, 1.9842 with 99; 1.9600 of a normal law."""
     for groups, half in ((10, 2.2622), (100, 1.9842), (None, 1.9600)):

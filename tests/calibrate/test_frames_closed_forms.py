@@ -324,11 +324,69 @@ def test_variances_that_rounding_hides_fit_nothing():
     assert found.quantised_pixels == 150 and found.p_value == found.expected_chi2 == 1 and found.dof == 0
 
 
+def test_pixels_that_hardly_respond_are_below_a_fiftieth_of_their_like():
+    """Of a tile of 2 × 3 px of unlike rates: a fiftieth, ten errors, one dead neighbour; in corners too."""
+    own = np.array([[900.0, 70.0, 5000.0], [300.0, 2500.0, 40.0]])
+    rate = np.tile(own, (8, 9))
+    error = 1e-3 * rate
+    dead = {(4, 6): 0.019, (9, 10): 0.019, (2, 20): 0.0, (6, 3): 0.015, (0, 0): 0.01, (1, 26): 0.0, (14, 12): 0.01}
+    for place, part in dead.items():
+        rate[place] *= part
+    rate[11, 5] *= 0.021  # alive
+    rate[8, 18], error[8, 18] = 10.0, 95.0  # of 900, known to 95: not ten errors below
+    rate[12, 24], error[12, 24] = 10.0, 85.0
+    rate[14, 25] = np.nan  # unknown
+    given = SimpleNamespace(rate_dn_per_s=rate, standard_error_dn_per_s=error)
+    found = frame_calibration._unresponsive(given, (2, 3))
+    assert {tuple(place) for place in np.argwhere(found).tolist()} == {*dead, (12, 24)}
+
+
 def test_sensors_without_event_pixels_have_no_signal_at_them():
     sensor = SimpleNamespace(tile_rows=["ab"], evs_grid=None)
     rate = SimpleNamespace(rate_dn_per_s=np.ones((4, 4)), standard_error_dn_per_s=np.ones((4, 4)))
     signal, uneven = composite.signal_at_event_pixels(rate, sensor)
     assert signal.shape == uneven.shape == (0, 0) and signal.dtype == np.float32 and uneven.dtype == np.bool_
+
+
+def test_signals_at_event_pixels_are_those_of_their_filter_around():
+    """A tile of 2 × 3 px: red and blue frame pixels, an event pixel that gives frames too, one of red, one of white.
+
+    The mean over red pixels within 3 σ, each by its distance, summed by hand; a strong step of the scene is told.
+    """
+    tile = ["abE", "WbF"]
+    kinds = {
+        "a": ("red", "aps"),
+        "b": ("blue", "aps"),
+        "E": ("red", "evs"),
+        "W": ("white", "evs"),
+        "F": ("blue", "aps evs"),
+    }
+    sensor = SimpleNamespace(
+        tile_rows=tile, evs_grid=SimpleNamespace(rows_per_tile=1, cols_per_tile=3),
+        pixels={key: SimpleNamespace(filter=name, roles=roles.split()) for key, (name, roles) in kinds.items()},
+        positions=lambda role: [
+            (i, j) for i in range(2) for j in range(3) if role in kinds[tile[i][j]][1].split()
+        ],
+    )  # fmt: skip
+    y, x = np.mgrid[:28, :45]
+    rate = (100 + 3.0 * y + 2.0 * x).astype(np.float32)
+    rate[:, 30:] += 400
+    given = SimpleNamespace(rate_dn_per_s=rate, standard_error_dn_per_s=np.full(rate.shape, 0.5, np.float32))
+    signal, uneven = composite.signal_at_event_pixels(given, sensor)
+    assert signal.shape == uneven.shape == (14, 45)
+    np.testing.assert_array_equal(signal[:, 2::3], rate[1::2, 2::3])
+    assert np.isnan(signal[:, 1::3]).all()  # no frame pixel has the filter of the white one
+    sigma, reach = composite._SIGMA_PX, int(3 * composite._SIGMA_PX + 0.5)
+    for i, j in ((4, 5), (7, 3), (5, 6)):
+        row, col = 2 * i, 3 * j + 2
+        weights, values = [], []
+        for r in range(row - reach, row + reach + 1):
+            for c in range(col - reach, col + reach + 1):
+                if r % 2 == 0 and c % 3 == 0:
+                    weights.append(np.exp(-((r - row) ** 2 + (c - col) ** 2) / (2 * sigma**2)))
+                    values.append(rate[r, c])
+        assert signal[i, 3 * j] == pytest.approx(np.average(values, weights=weights), rel=1e-5)
+    assert uneven[3:11, 27].all() and not uneven[3:11, 3:24:3].any() and not uneven[:, 2::3].any()
 
 
 def test_pixels_are_unlike_their_kind_by_the_scatter_of_their_variances():

@@ -14,6 +14,7 @@ from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal
 from hesim_render.calibrate.asynchronous import likelihood
 from hesim_render.calibrate.asynchronous import output as trials_output
+from hesim_render.calibration import sensor_values
 from hesim_render.core.errors import SpecError
 
 #: Half of an interval of 95 % of a normal law, errors.
@@ -78,6 +79,29 @@ def test_noise_of_emva_captures_in_electrons_with_its_error():
     check(pairs_output._dark_noise(calibration(), K, RELATIVE), noise, noise * np.hypot(error, RELATIVE), "e-", Z)
     less = pairs_output._dark_noise(calibration(row=(-0.3, 0.05), col=(-0.2, 0.03)), K, RELATIVE)
     assert less["value"] == pytest.approx(np.sqrt(8.9 - 1 / 12) / K)
+
+
+def test_noise_below_a_grey_value_is_that_of_the_long_series_less_what_else_it_holds():
+    """In squares: rows, columns and lines for the pixels' own noise, and the dark current of 13 ms for both."""
+    pairs = SimpleNamespace(spatial_dark=SimpleNamespace(exposure_s=0.013))
+    given = {"dark_noise_is_rounded_off": True, "pairs": pairs, "row": (0.011, 0.002), "col": (-0.004, 0.001),
+             "lines_dn2": 0.007}  # fmt: skip
+    series = SimpleNamespace(low=0.36, value=0.39, high=0.43)
+    current = 17.0 * K * 0.013
+    for tell, other in ((pairs_output._read_noise, 0.011 + 0.007 + current), (pairs_output._dark_noise, current)):
+        found = tell(calibration(rounded_noise=series, **given), K, RELATIVE)
+        low, value, high = (np.sqrt(v**2 - other) for v in (0.36, 0.39, 0.43))
+        error = (high - low) / (2 * Z)
+        check(found, value / K, value / K * np.hypot(error / value, RELATIVE), "e-")
+        expected = low / K * (1 - Z * RELATIVE), high / K * (1 + Z * RELATIVE)
+        assert found["interval_95"] == pytest.approx(expected, rel=1e-6) and found["value_dn"] == pytest.approx(value)
+    # known to a quarter; hidden by the rest, uncertain by more than a quarter, or never seen
+    for noise, limit in (((0.33, 0.43), None), ((0.29, 0.43), 0.43), ((0.35, 0.6), 0.49), (None, 0.49)):
+        series = None if noise is None else SimpleNamespace(low=noise[0], value=0.39, high=noise[1])
+        found = pairs_output._read_noise(calibration(rounded_noise=series, **given), K, RELATIVE)
+        assert (found["value"] is None) == (limit is not None)
+        if limit is not None:
+            assert found["upper_limit"] == pytest.approx(limit / K) and f"at most {limit:.2g} DN" in found["reason"]
 
 
 def test_efficiency_dark_current_and_full_well_of_emva_captures():
@@ -380,3 +404,25 @@ def test_captures_are_refused_from_their_limits_on(part, is_refused):
         light_curve.require_steady_light, pairs, curve, light, 2 * light * off, np.array([1, 1, 1, 1, 0], bool)
     )
     assert refused(act, "this pair is 2 % off") is is_refused
+
+
+def test_the_asymmetry_is_that_of_static_counts_or_of_steps_whichever_is_better_known():
+    """The error of (θ₋ − θ₊)/(θ₋ + θ₊) by central differences in both thresholds."""
+
+    def of(value, error=None):
+        return SimpleNamespace(value=value, error=error)
+
+    def ratio(on, off):
+        return (off - on) / (off + on)
+
+    on, off = of(0.2, 0.004), of(0.27, 0.011)
+    h = 1e-6
+    slopes = [(ratio(0.2 + a, 0.27 + b) - ratio(0.2 - a, 0.27 - b)) / (2 * h) for a, b in ((h, 0), (0, h))]
+    error = np.hypot(slopes[0] * 0.004, slopes[1] * 0.011)
+    for part, expected in ((0.98, 0.11), (1.02, ratio(0.2, 0.27))):
+        given = SimpleNamespace(asymmetry=of(0.11, part * error), theta_on=on, theta_off=off)
+        assert sensor_values._asymmetry(given) == pytest.approx(expected)
+    unknown = SimpleNamespace(asymmetry=of(None), theta_on=on, theta_off=off)
+    assert sensor_values._asymmetry(unknown) == pytest.approx(ratio(0.2, 0.27))
+    for static, expected in ((of(0.11, 9.0), 0.11), (of(None), 0.0)):
+        assert sensor_values._asymmetry(SimpleNamespace(asymmetry=static, theta_on=of(None), theta_off=off)) == expected

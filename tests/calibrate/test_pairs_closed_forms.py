@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2 as chi2_law
 from scipy.stats import gamma
 
-from hesim_render.calibrate.aps import light_curve, noise_spectrum, spatial
+from hesim_render.calibrate.aps import light_curve, noise_spectrum, pairs, spatial
 from hesim_render.calibrate.aps.light_curve import require_steady_light
 from hesim_render.calibrate.aps.pair_levels import Levels, pair_statistics
 from hesim_render.core.errors import SpecError
@@ -333,3 +333,26 @@ def test_light_that_is_off_by_two_percent_is_refused(level, off, is_clear, is_re
         return
     with pytest.raises(SpecError, match=r"^0: the light drifts between exposures: this pair is 2\.1 % off"):
         require_steady_light(pairs, curve, light, signal, clear)
+
+
+def test_noise_told_by_grey_values_joins_the_fit_as_a_measurement(monkeypatch):
+    """β₀ + t β₂ = σ² less what rows and columns share: the sum of both informations, written out."""
+    monkeypatch.setattr(pairs, "replace", lambda fit, **changed: SimpleNamespace(**changed))
+    root = np.random.default_rng(3).standard_normal((6, 6)) * [0.3, 0.02, 0.9, 0.01, 0.02, 0.03]
+    fit = SimpleNamespace(
+        beta=np.array([0.3, 0.2, 1.1, 0.01, 0.0, 0.02]), covariance=root.T @ root, identified=np.ones(6, bool)
+    )
+    result = SimpleNamespace(
+        fit=fit, rounded_noise=SimpleNamespace(value=0.61, low=0.57, high=0.66), row=(0.03, 0.021), col=(-0.02, 0.034),
+        pairs=SimpleNamespace(spatial_dark=SimpleNamespace(exposure_s=0.23)),
+    )  # fmt: skip
+    found = pairs._with_dark_noise(result)
+    line = np.array([1, 0, 0.23, 0, 0, 0])
+    own = (2 * 0.61 * (0.66 - 0.57) / (2 * 1.959964)) ** 2 + 0.021**2 + 0.034**2
+    known = np.linalg.inv(fit.covariance)
+    covariance = np.linalg.inv(known + np.outer(line, line) / own)
+    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(
+        found.beta, covariance @ (known @ fit.beta + line * (0.61**2 - 0.03) / own), rtol=1e-5, atol=1e-9
+    )
+    assert pairs._with_dark_noise(SimpleNamespace(fit=fit, rounded_noise=None)) is fit

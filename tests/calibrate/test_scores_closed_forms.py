@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from hesim_render.calibrate.evs import analysis, checks, defects, fit, goodness
+from hesim_render.calibrate.evs import analysis, checks, defects, fit, fitted, goodness
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_likelihood, log_probability
-from hesim_render.calibrate.flicker import unsteady
+from hesim_render.calibrate.flicker import dynamics, unsteady
 from hesim_render.calibration.spec import Defect
 from hesim_render.core.errors import SpecError
 
@@ -54,8 +54,9 @@ def test_scores_are_slopes_of_the_likelihood(weighed):
 
 
 @pytest.mark.parametrize("weighed", [False, True])
-def test_the_covariance_is_that_of_the_scores_of_single_pixels(weighed):
-    """Bread, meat and bread: a loop over 40 pixels with two counts each, each pixel so many times."""
+def test_the_covariance_is_that_of_the_scores_of_single_pixels(weighed, monkeypatch):
+    """Bread, meat and bread: a loop over 40 pixels with two counts each, so many times each; 7 are summed at once."""
+    monkeypatch.setattr(fit, "_CHUNK", 7)
     rng = np.random.default_rng(2)
     cells, p = some_cells(rng)
     variance = 1.7 * cells.total * p * (1 - p) if weighed else None
@@ -92,6 +93,12 @@ def test_groups_of_brightness_hold_pixels_and_events():
     wide = goodness._wider(np.array([60.0, 50, 30, 30, 50, 99, 3]))
     sums = np.bincount(wide, [60.0, 50, 30, 30, 50, 99, 3])
     assert np.all(np.diff(wide) >= 0) and sums[:-1].min() >= 60 and sums[-1] >= 100
+
+
+def test_a_goodness_without_degrees_of_freedom_says_nothing():
+    for dof, per_dof, chance in ((9, 14.4 / 9, chi2.sf(14.4, 9)), (0, 1.0, 1.0), (-3, 1.0, 1.0)):
+        found = goodness.Goodness(14.4, dof)
+        assert (found.per_dof, found.p_value) == pytest.approx((per_dof, chance))
 
 
 def one_fit(**given):
@@ -153,6 +160,22 @@ def test_brightness_and_events_that_tell_nothing_are_refused(tmp_path):
         analysis._check_brightness(static(5.0, 51), good, captures)
 
 
+def test_of_two_parameters_the_one_goes_without_which_the_fit_is_better(monkeypatch):
+    """Each is left out alone; one that is not free stays so."""
+    asked = []
+
+    def fit(cells, eta, theta_v, law, free):
+        asked.append(free)
+        return free, None, None
+
+    monkeypatch.setattr(fitted, "_fit", fit)
+    for likelihoods, better in (((-3.0, -5.0), True), ((-5.0, -3.0), False)):
+        values = iter(likelihoods)
+        monkeypatch.setattr(fitted, "_log_likelihood", lambda *_, values=values: next(values))
+        assert fitted._better_without(0, 2, None, ETA, 2.3, "sqrt", [True, False, True, True, True, True]) == better
+    assert asked == 2 * [[False, False, True, True, True, True], [True, False, False, True, True, True]]
+
+
 @pytest.mark.parametrize("more", [0.98, 1.02])
 def test_a_pixel_is_unsteady_beyond_a_tail_of_1e_6(more):
     """χ² of 20 parts about a rate, its deviation from 19 divided by √(1 + 1/(2 mean)); ten events are needed."""
@@ -163,6 +186,26 @@ def test_a_pixel_is_unsteady_beyond_a_tail_of_1e_6(more):
     few = np.zeros((20, 2))
     few[0] = 9, 10  # all events in one part
     assert unsteady(few, 400).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(("trials", "firing", "rate", "correlation", "usual"), [
+    (30, 0.37, 0.6, 0.93, 0.02), (45, 0.7, 0.3, 0.8, 0.05), (80, 0.2, 0.9, 0.985, 0.0),
+])  # fmt: skip
+def test_share_and_correlation_follow_from_the_moments_of_successive_counts(trials, firing, rate, correlation, usual):
+    """The moments of a chain of two states, summed trial by trial, as those of a wave of 4001 parts."""
+    i = np.arange(trials)
+    own = rate**2 * firing * (1 - firing)
+    within = own * (np.sum(correlation ** np.abs(i[:, None] - i)) - trials)
+    neighbour = own * np.sum(correlation ** (i[:, None] + trials - i))
+    mean = trials * (rate * firing + usual)
+    variance = mean * (1 - mean / trials) + within
+    wave = np.sqrt(2 * variance) * np.cos(np.arccos(neighbour / variance) * np.arange(4001) + 0.3)
+    steady = np.sqrt(mean) * np.where(np.arange(4001) % 2, 0.3, -0.3)
+    share, found = dynamics(mean + np.stack([wave, steady], axis=1), trials, usual)
+    assert share[0] == pytest.approx(firing, rel=0.02) and np.log(found[0]) == pytest.approx(
+        np.log(correlation), rel=0.05
+    )
+    assert (share[1], found[1]) == (1, 0)
 
 
 def static_of(lit, dark, signal, parts=None, trials=10_000):

@@ -499,3 +499,21 @@ def test_windows_that_hold_whole_events_of_every_pixel_tell_no_limit(pixels, is_
     """Up to 2 % below 1 event, or 3, of each pixel, as a few pixels are silent; above 1 it is no whole number."""
     found, _ = readout_limit([windows_of({5000: 60, 4999: 60}, pixels)])
     assert ("events of every pixel" in found.get("reason", "")) == is_limit_of_pixels
+
+
+@pytest.mark.parametrize(("events", "pixels", "is_unsteady"), [
+    (300.0, 5000, True), (300.0, 20, True), (1.5, 5000, False), (1.5, 20, False),
+])  # fmt: skip
+def test_a_rate_that_doubles_is_unsteady_beyond_four_errors_of_counting(events, pixels, is_unsteady):
+    """In both polarities together, whatever the rate of a pixel is; the last quarter has twice the first."""
+    course = events * np.linspace(0.62, 1.38, still.SLICES)
+    tally = SimpleNamespace(slices=np.stack([0.7 * course, 0.3 * course])[..., None], pixels=pixels, seconds=8.0)
+    found = still.unsteady(tally)
+    assert (found is not None) == is_unsteady
+    if is_unsteady:
+        rate = course / (pixels * 8.0 / still.SLICES)
+        quarter = still.SLICES // 4
+        early, late = rate[:quarter].mean(), rate[-quarter:].mean()
+        assert f"from {early:.4g} to {late:.4g} Hz a pixel, at most {rate.max():.4g}" in found
+    tally.slices[:] = events / 2
+    assert still.unsteady(tally) is None

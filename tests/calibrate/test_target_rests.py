@@ -6,6 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
 
 from hesim_render.calibrate.recordings import rests, target
 from hesim_render.calibrate.recordings.tally import GROUPS, STEPS, tally
@@ -103,6 +105,121 @@ def test_the_highest_level_of_noise_is_that_of_simulated_noise(cutoff_hz, drift,
         square = levels[-1] ** 2 - np.trapezoid(2 * levels * law, levels)
         assert mean == pytest.approx(values.mean(), rel=0.03)
         assert np.sqrt(square - mean**2) == pytest.approx(values.std(), rel=0.06)
+
+
+@pytest.mark.parametrize("drift", [0.0, 1.7, -2.3])
+def test_crossings_are_those_of_a_moving_level_summed_over_time(drift):
+    """Noise crosses a level that moves by its velocity against it: before, during and after a rest, each seen slowly.
+
+    Crossings downwards end what was above while the light rose. Slopes as fast as the noise, so that each part counts.
+    """
+    sigma, cutoff_hz, rest_s = 0.21, 29.0, 0.043
+    pole = 2 * np.pi * cutoff_hz / np.sqrt(np.sqrt(2) - 1)
+    ramps = rests.Ramps((0.7 * pole * sigma, 0.4 * pole * sigma), drift * sigma * pole / 50, rest_s)
+
+    def passing(velocity):
+        """Mean part of the noise's velocity above one, per second, in σ."""
+        return pole * quad(lambda v: max(v - velocity / pole, 0) * norm.pdf(v), -9, 9, points=[velocity / pole])[0]
+
+    def crossed(level, slope, velocity, seconds):
+        """In the time that the level moves away by a slope; noise of such a velocity reaches it."""
+        at = np.linspace(0, seconds, 20_001)
+        return passing(velocity) * np.trapezoid(np.interp(level + slope * at, rests._GRID, rests._RATE), at)
+
+    before, after = (slope / sigma for slope in ramps.slopes)
+    own, t = ramps.drift / sigma, np.array([0.3, 1.0]) * rest_s
+    for is_over in (False, True):
+        found = rests.highest(np.array(sigma), np.array(cutoff_hz), ramps, t, is_over)
+        for k, level in ((0, 55), (1, 55), (0, 70), (1, 85)):
+            u = rests._LEVELS[level]
+            crossings = crossed(u, before, before, 12 / before) + crossed(u, -own, -own, t[k])
+            crossings += is_over * crossed(u - own * t[k], after, after, 12 / after)
+            assert found[k, level] == pytest.approx(norm.cdf(u) * np.exp(-crossings), rel=2e-3)
+
+
+@pytest.mark.parametrize("is_noisy", [False, True])
+@pytest.mark.parametrize("drift", [0.0, 0.7])
+def test_late_events_are_poisson_numbers_of_the_rise_of_the_highest_level(monkeypatch, is_noisy, drift):
+    """With their scatter; of noisy rests the sum alone. The leak has a normal law of its logarithm."""
+
+    def highest(noise, cutoff_hz, ramps, times_s, is_over):
+        shift = 0.3 * np.log(cutoff_hz)[..., None, None] + ramps.drift + 40 * np.asarray(times_s)[:, None] + is_over
+        return norm.cdf(rests._LEVELS - shift + 0.1 * np.asarray(noise)[..., None, None])
+
+    monkeypatch.setattr(rests, "highest", highest)
+    edges, late = np.array([0.004, 0.011, 0.02]), np.array([70.0, 40.0])
+    rest = rests.Rest(rests.Ramps((9.0, 7.0), drift, 0.02), edges, late, 900.0, 1.7, is_noisy)
+    log, mean = rests._posterior(rest)
+    leaks = rests._LEAK if drift else np.ones(1)
+    assert log.shape == mean.shape == (leaks.size, rests._CUTOFF_HZ.size, rests._NOISE.size)
+    for a, b, c in ((0, 0, 0), (leaks.size - 1, 7, 30), (leaks.size // 2, 19, 12)):
+        noise, cut = rests._NOISE[c], rests._CUTOFF_HZ[b]
+        levels = []
+        for t, over in ((edges[0], False), (edges[1], False), (edges[2], True)):
+            law = norm(0.3 * np.log(cut) + leaks[a] * drift + 40 * t + over - 0.1 * noise)
+            levels.append(noise * (8 - quad(law.cdf, -5, 8)[0]))  # the mean of a law, from its top
+        expected = np.maximum(900 * np.diff(levels), 1e-9)
+        seen = late
+        if is_noisy:
+            expected, seen = expected.sum(keepdims=True), late.sum(keepdims=True)
+        chance = np.sum(seen * np.log(expected) - expected) / 1.7 - 0.5 * (np.log(leaks[a]) / 0.6) ** 2
+        assert mean[a, b, c] == pytest.approx(levels[-1], rel=1e-3)
+        assert log[a, b, c] == pytest.approx(chance, rel=2e-3)
+
+
+def test_overshoots_weigh_noise_bandwidth_and_leak_by_both_rests(monkeypatch):
+    """The bandwidth is common: a value has the chance of its own rest, times that of its cut-off in both."""
+    rng, cuts, noises = np.random.default_rng(8), rests._CUTOFF_HZ.size, rests._NOISE.size
+    ramps = rests.Ramps((9.0, 7.0), 0.6, 0.02), rests.Ramps((5.0, 11.0), 0.0, 0.03)
+    both = [rests.Rest(each, np.array([0.01, 0.02]), np.ones(1), 9.0, 1.0, noisy) for each, noisy in
+            zip(ramps, (False, True), strict=True)]  # fmt: skip
+    shapes = (rests._LEAK.size, cuts, noises), (1, cuts, noises)
+    known = []
+    for k, shape in enumerate(shapes):
+        log = -0.5 * ((np.arange(cuts)[:, None] - 8 - 3 * k) / 3) ** 2 - 0.5 * ((np.arange(noises) - 20 + k) / 4) ** 2
+        log = log + 0.3 * rng.standard_normal(shape) - 0.2 * np.arange(shape[0])[:, None, None]
+        mean = (
+            0.4 * rests._NOISE * (1 + 0.03 * np.arange(cuts))[:, None] * (1 + 0.05 * np.arange(shape[0]))[:, None, None]
+        )
+        known.append((log, mean))
+    given = {id(rest): one for rest, one in zip(both, known, strict=True)}
+    asked = []
+
+    def highest(noise, cutoff_hz, ramps, times_s, is_over):
+        asked.append((noise, cutoff_hz, ramps, times_s.tolist(), is_over))
+        return norm.cdf(rests._LEVELS, 1.2, 0.8)[None]
+
+    monkeypatch.setattr(rests, "_posterior", lambda rest: given[id(rest)])
+    monkeypatch.setattr(rests, "highest", highest)
+    found = rests.overshoots(*both, 50)
+    of_cut = np.ones(cuts)
+    for log, _ in known:
+        of_cut *= np.exp(log).sum(axis=(0, 2))
+    of_cut /= of_cut.sum()
+    for one, rest, (log, mean), call in zip(found, both, known, asked, strict=True):
+        weight = np.exp(log) / np.exp(log).sum(axis=(0, 2))[:, None] * of_cut[:, None]
+        assert weight.sum() == pytest.approx(1)
+        order = np.argsort(mean, axis=None)
+        below = np.cumsum(weight.ravel()[order])
+        low, value, high = (float(np.interp(p, below, mean.ravel()[order])) for p in (0.025, 0.5, 0.975))
+        # twice the error of the law of late events besides
+        ends = value - np.hypot(value - low, 0.1 * value), value + np.hypot(high - value, 0.1 * value)
+        expected = (0.0, max(ends[1], 2 * value)) if rest.is_noisy else ends
+        assert (one.mean, one.low, one.high) == pytest.approx((value, *expected), rel=1e-9)
+        leaks = (np.ones(1) if rest.ramps.drift == 0 else rests._LEAK) * rest.ramps.drift
+        share = weight.sum(axis=(1, 2))
+        assert one.drift == pytest.approx(share @ leaks, rel=1e-9)
+        assert one.drift_error == pytest.approx(np.sqrt(share @ (leaks - share @ leaks) ** 2), abs=1e-12)
+        # the law of a likely value whose mean is the nearest one
+        likely = weight > 1e-3 * weight.max()
+        assert not likely.all()
+        leak, cut, noise = min(np.argwhere(likely), key=lambda k: abs(mean[tuple(k)] - value))
+        own = rests._NOISE[noise]
+        assert call[:2] == (own, rests._CUTOFF_HZ[cut]) and call[3:] == ([rest.ramps.rest_s], True)
+        assert call[2].drift == pytest.approx(leaks[leak])
+        law = norm.cdf(rests._LEVELS, 1.2, 0.8)
+        quantiles = own * np.interp((np.arange(50) + 0.5) / 50, law / law[-1], rests._LEVELS)
+        np.testing.assert_allclose(one.quantiles, quantiles - quantiles.mean() + value, rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["low thresholds", "slow, no leak"])

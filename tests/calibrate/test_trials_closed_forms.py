@@ -143,6 +143,36 @@ def test_the_variance_of_a_cell_is_that_of_counting_and_of_thresholds(spread):
         np.testing.assert_allclose(np.exp(log_probability(eta, given, 2.3, "linear")[0]), mean, rtol=1e-6)
 
 
+def test_typical_pixels_have_the_rates_of_the_median_threshold():
+    """Two scenes of 40 × 60 pixels with a spread of 12 %; u rises with the light, ON and OFF differ, two in three are
+    good.
+    """
+    rng, trials, shape = np.random.default_rng(15), 2000, (40, 60)
+    good = rng.random(shape) < 0.67
+    signal = rng.permutation(np.linspace(50, 900, good.size)).reshape(shape)
+    theta = 1 + 0.12 * rng.standard_normal(shape)
+
+    def truth(light, sign):
+        return 1.5 + 0.001 * light + 0.15 * sign
+
+    sessions = []
+    for light in (signal, np.zeros(shape)):
+        counts = [rng.binomial(trials, norm.cdf(-theta * truth(light, sign))) for sign in (1, -1)]
+        sessions.append((light, *(np.where(good, each, 1999) for each in counts)))
+    found = medians.Typical.of(SimpleNamespace(sessions=sessions, trials=trials), good)
+    cells = found.cells
+    assert found.spread == pytest.approx(0.12, rel=0.15) and len(found.lines) == 4
+    assert cells.pixels.sum() == pytest.approx(4 * good.sum()) and set(cells.polarity) == {1, -1}
+    expected = norm.cdf(-truth(cells.signal_dn, cells.polarity))
+    np.testing.assert_allclose(cells.events / (cells.pixels * trials), expected, rtol=0.15)
+    assert np.mean(cells.events / (cells.pixels * trials) / expected) == pytest.approx(1, abs=0.03)
+    for count, sign in ((0, 1), (1, -1)):
+        light = np.array([200.0, 700.0])
+        np.testing.assert_allclose(found.threshold_over_noise(count, light), truth(light, sign), rtol=0.04)
+        middles = found.lines[count][0]
+        assert found.group(count, middles + 0.4 * np.gradient(middles)).tolist() == list(range(middles.size))
+
+
 def test_groups_of_like_brightness_are_of_200_pixels_or_more():
     signal = np.random.default_rng(6).permutation(np.arange(950.0))
     group = medians.like_brightness(signal)
@@ -306,6 +336,29 @@ def test_the_mismatch_of_both_polarities_is_weighed_by_their_covariance(on, off)
     whole[np.ix_(k, k)] = np.nan
     found = analysis._mismatch(SimpleNamespace(values=values, covariance=whole))
     assert (found.value, found.limit) == (0, max(on, off)) and np.isnan(found.error)
+
+
+def test_thresholds_of_pixels_are_the_means_of_what_their_counts_leave(monkeypatch):
+    """Of 11 pixels, four at once: mean and deviation over the grid, relative to the threshold of the fit."""
+    monkeypatch.setattr(analysis, "_CHUNK", 4)
+    monkeypatch.setattr(analysis, "TrialCounts", SimpleNamespace(of=lambda sets, polarity: sets))
+    rng, grids = np.random.default_rng(3), (np.array([0.1, 0.17, 0.26, 0.3]), np.array([0.2, 0.28, 0.33, 0.41]))
+    weights = rng.dirichlet(np.ones(4), 11)
+
+    def given(sets):
+        assert sets[0].tolist() == sets[1].tolist() and sets[0].size <= 4
+        return weights[sets[0]]
+
+    values = np.arange(9.0)
+    values[:2] = 0.21, 0.29
+    found_fit = SimpleNamespace(values=values, likelihood=SimpleNamespace(grids=grids), law_given=given)
+    trials = SimpleNamespace(calm=np.zeros((3, 11)), of=lambda some: some)
+    for polarity, theta, grid in ((1, 0.21, grids[0]), (-1, 0.29, grids[1])):
+        mean, spread = analysis._pixel_thresholds(found_fit, trials, trials, polarity)
+        expected = weights @ grid / theta
+        np.testing.assert_allclose(mean, expected, rtol=1e-6)
+        deviation = np.sqrt(np.sum(weights * (grid / theta - expected[:, None]) ** 2, axis=1))
+        np.testing.assert_allclose(spread, deviation, rtol=1e-4)
 
 
 def test_pixels_are_unlike_the_fit_by_any_test_that_few_fail(monkeypatch):

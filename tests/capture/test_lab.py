@@ -171,6 +171,25 @@ def test_the_truth_stands_beside_the_estimate(session):
     assert not any("truth" in line for line in summary_lines(calibrated, "aps"))
 
 
+def test_the_truth_of_events_is_the_law_that_pixels_follow():
+    """P = Q(u) in still light, u = Θ (A I + B)/√(2 (1 + C² I²)) for the mean of both thresholds, I in DN."""
+    one = {"beta1": 1.3e-3, "beta2": 7e-3, "beta3": 4.1e-4, "beta4": 1.9e-3, "beta5": 0.0}
+    changes = {
+        "evs.coefficients": [one], "evs.contrast_threshold_on": 0.19, "evs.contrast_threshold_off": 0.31,
+        "evs.threshold_hardware_v": 0.43, "evs.threshold_mismatch_rel": 0.0,
+    }  # fmt: skip
+    sensor = hr.load_sensor("gen2", changes).crop(16, 8)
+    bench = set_up(sensor, LIT_EXPOSURES_US)
+    truth = truth_of(bench, 80_000)["evs"]
+    for electrons in (0.0, 3.0, 40.0):
+        signal_dn = electrons / (sensor.spec.evs.window_us * 1e-6) * bench.event_dn_per_e_per_s[0, 0]
+        shot = 1 + (truth["C"] * signal_dn) ** 2
+        u = 0.43 * (truth["A"] * signal_dn + truth["B"]) / np.sqrt(2 * shot)
+        for found, theta in zip(sensor.evs.event_probability(electrons, electrons), (0.19, 0.31), strict=True):
+            assert found == pytest.approx(ndtr(-u * theta / 0.25), rel=1e-5)
+    assert truth["D"] == 0 and (truth["theta_on"], truth["theta_off"]) == (0.19, 0.31)
+
+
 def test_the_truth_knows_what_is_off_or_mixed():
     sensor = hr.load_sensor("eiger", {"aps.residual_noise_dn": 0.6, "evs.leak_rate_hz": 3.0}).crop(16, 8)
     off = ["aps.read", "aps.dsnu", "aps.dark_current", "evs.shot", "evs.mismatch"]

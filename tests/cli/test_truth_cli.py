@@ -66,4 +66,6 @@ def test_cube_writes_a_spectral_exr(capsys, tmp_path):
 def test_bands_that_are_none_are_refused(text):
     with pytest.raises(RangeError, match="--bands"):
         parse_bands(text)
+    # the last one too where (400.7 - 400)/0.1 is below 7 in double precision
+    assert parse_bands("400:400.7:0.1") == pytest.approx([400 + 0.1 * k for k in range(8)])
     assert parse_bands("400:420:10") == [400, 410, 420] and parse_bands("450, 550") == [450, 550]

@@ -279,6 +279,23 @@ def test_rates_at_a_fixed_tick_against_the_stage():
     assert on == pytest.approx(curves.on_hz[0], rel=0.12) and off == pytest.approx(curves.off_hz[0], rel=0.12)
 
 
+def test_leak_and_comparators_act_where_a_tick_has_no_event_yet():
+    """At a tick of 1 ms: 31 % ON and 23 % OFF by noise, then leak of 300 Hz, then the comparators' own events."""
+    changes = {
+        "evs.contrast_threshold_on": 0.03, "evs.contrast_threshold_off": 0.045, "evs.threshold_mismatch_rel": 0.2,
+        "evs.leak_rate_hz": 300.0, "evs.comparator_noise": {"on_hz": 90.0, "off_hz": 160.0},
+    }  # fmt: skip
+    sensor = hr.load_sensor("reference-mono", changes).crop(128, 128)
+    lux = 2.0
+    curves = event_curves(sensor, [lux])
+    stage, light, tick_us = EvsStage(sensor.evs, 3), electrons(sensor, lux), sensor.spec.evs.tick_us
+    events = np.concatenate([stage.step(light, tick_us * (k + 1)) for k in range(61)])
+    scale = 60 * 128**2 * tick_us * 1e-6
+    on, off = (np.sum(events["polarity"] == sign) / scale for sign in (1, -1))
+    # 450,000 and 280,000 events; successive comparisons share a sample
+    assert on == pytest.approx(curves.on_hz[0], rel=8e-3) and off == pytest.approx(curves.off_hz[0], rel=8e-3)
+
+
 def test_photon_transfer_is_that_of_the_emva_standard():
     sensor = hr.load_sensor("imx250")
     electrons_, mean, deviation = photon_transfer(sensor)

@@ -98,6 +98,16 @@ def test_rates_times_intervals_are_the_events():
     assert rate.t_us.tolist() == edges[:-1]
 
 
+def test_intervals_are_as_many_as_fit_but_for_rounding():
+    """24 of 97.1 µs are 2330.4 µs, whose quotient in double precision is above 24: a 25th one would have no length."""
+    assert 2330.4 / 97.1 > 24
+    for begin, end, number in ((0.0, 2330.4, 24), (0.0, 2330.5, 25), (7.3, 7.3 + 97.1 * 3, 3)):
+        rate = event_rate(NONE, 97.1, begin, end)
+        np.testing.assert_allclose(rate.t_us, begin + 97.1 * np.arange(number))
+        assert not rate.on_per_s.any() and np.isfinite(rate.on_per_s).all()
+        assert event_frames(NONE, SHAPE, 97.1, begin, end).shape == (number, *SHAPE)
+
+
 def test_no_events_give_empty_arrays_of_the_right_shape():
     assert event_frame(NONE, SHAPE).shape == SHAPE and not event_frame(NONE, SHAPE).any()
     assert event_frames(NONE, SHAPE, 10, 0, 100, "counts").shape == (10, 2, *SHAPE)

@@ -72,6 +72,19 @@ def test_each_hole_of_a_tile_that_is_not_square_gets_its_own_colour():
     np.testing.assert_allclose(found, mosaic_of(np.broadcast_to(colours, (*shape, 4)), filled), rtol=1e-6)
 
 
+def test_bad_pixels_of_a_tile_that_is_not_square_get_their_own_colour():
+    """Event pixels stay as they are, on the tile's diagonal too; every other cell has bad pixels."""
+    tile = np.array([(-1, 0, 2, 1), (2, 0, -1, 1), (1, 2, 0, -1)])
+    whole = mosaic_of(np.broadcast_to(np.array([3.0, 7.0, 11.0, 0.3], np.float32), (31, 45, 4)), tile)
+    bad = np.zeros(whole.shape, bool)
+    for number, (row, col) in enumerate(np.ndindex(tile.shape)):
+        bad[6 + row, 1 + 2 * number] = bad[13 + row, 20 + col] = True
+    assert {int(tile[r % 3, c % 4]) for r, c in np.argwhere(bad)} == {-1, 0, 1, 2}
+    found = fill.fill_pixels(np.where(bad, 99.0, whole).astype(np.float32), tile, bad)
+    events = tile[np.ix_(np.arange(31) % 3, np.arange(45) % 4)] < 0
+    np.testing.assert_allclose(found, np.where(events & bad, 99.0, whole), rtol=1e-6)
+
+
 @pytest.mark.parametrize(("size", "period", "margin"), [(13, 3, 8), (8, 4, 8), (5, 2, 4), (9, 5, 10)])
 def test_lines_beyond_the_sides_are_those_of_the_same_place_in_the_tile(size, period, margin):
     found, place = fill._kept_in_phase(size, period, margin), np.arange(-margin, size + margin)
@@ -170,6 +183,24 @@ def test_patches_are_found_on_the_chart():
         chart.patch_means(picture, [(64, 64), (64, 764), (448, 764), (448, 64)])
 
 
+def test_patches_end_at_the_sides_of_the_image():
+    """2 × 3 patches, 40 px apart along rows and 50 along columns: each takes half of the smaller distance."""
+    image = np.random.default_rng(7).random((71, 101, 3))
+    half = round(chart._SHARE * 20)
+    whole = [(half, half), (half, half + 80), (half + 50, half + 80), (half + 50, half)]
+    rows, cols = 50 + 2 * half + 1, 80 + 2 * half + 1
+    found = chart.patch_means(image[:rows, :cols], whole, 2, 3)
+    for number, (row, col) in enumerate((r, c) for r in (half, half + 50) for c in (half, half + 40, half + 80)):
+        part = image[row - half : row + half + 1, col - half : col + half + 1]
+        np.testing.assert_allclose(found[number], part.mean(axis=(0, 1)), rtol=1e-12)
+    for smaller in (image[: rows - 1, :cols], image[:rows, : cols - 1]):
+        with pytest.raises(RangeError, match="would lie outside"):
+            chart.patch_means(smaller, whole, 2, 3)
+    for shift in ((-1, 0), (0, -1)):
+        with pytest.raises(RangeError, match="would lie outside"):
+            chart.patch_means(image, np.array(whole) + shift, 2, 3)
+
+
 def test_patch_centres_follow_perspective():
     """Lines stay lines: the diagonals of the chart meet in the centre of any of its views."""
     corners = np.array([(10, 20), (30, 200), (150, 180), (120, 40)], dtype=float)
@@ -238,6 +269,21 @@ def test_local_tone_lowers_large_contrast_and_keeps_detail():
     for part in (left, right):
         assert part.std() / part.mean() == pytest.approx(0.05, rel=0.05)
     np.testing.assert_allclose(tone.tone_local(image, compression=1.0), image, rtol=1e-5)
+
+
+def test_detail_and_contrast_have_factors_of_their_own():
+    """A chessboard of ± 0.05 doublings about 2⁻² is detail but for 1.5 %, var/(var + 0.16); its mean is the base."""
+    ripple = 0.05 * np.where(np.add.outer(np.arange(60), np.arange(84)) % 2, 1.0, -1.0)
+    image = (2.0 ** (ripple - 2))[..., None] * np.array([0.6, 1.1, 1.4])
+    image /= np.array([0.2126, 0.7152, 0.0722]) @ np.array([0.6, 1.1, 1.4])
+    found = np.log2(tone.tone_local(image.astype(np.float32), 0.7, 1.8, 9))[20:-20, 20:-20]
+    tint = np.log2(image / image[..., :1])[20:-20, 20:-20]
+    np.testing.assert_allclose(found - found[..., :1], tint, atol=1e-4)
+    luminance = np.log2(2.0**found @ np.array([0.2126, 0.7152, 0.0722]))
+    own = 0.05**2 / (0.05**2 + 0.16)
+    assert luminance.mean() == pytest.approx(0.7 * -2, abs=2e-3)
+    size = np.sum((luminance - luminance.mean()) * ripple[20:-20, 20:-20]) / np.sum(ripple[20:-20, 20:-20] ** 2)
+    assert size == pytest.approx(own * 0.7 + (1 - own) * 1.8, rel=0.01)
 
 
 def test_automatic_exposure_brings_highlights_to_the_level():

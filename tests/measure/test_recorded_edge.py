@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import recordings
 from rendering import flux_image, make_scene, mono
 
 import hesim_render as hr
 from hesim_render import cli
 from hesim_render.core.errors import RangeError
-from hesim_render.measure import edge_response, measure_mtf
+from hesim_render.measure import edge_response, measure_mtf, slanted_edge
 
 FREQUENCY = np.linspace(0, 0.5, 51)
 LIGHT = {"type": "uniform", "illuminance_lux": 1000}
@@ -90,6 +91,26 @@ def test_one_filter_of_a_mosaic_is_measured_in_a_part_of_a_frame(recording):
             measure_mtf(loaded, region=region, filter_name=known[0])
     with pytest.raises(RangeError, match="frame is 7; expected 0 to 0"):
         measure_mtf(loaded, 7, filter_name=known[0])
+
+
+@pytest.mark.parametrize("signal", ["raw", "electrons"])
+def test_a_part_of_a_frame_keeps_the_places_of_its_filter(monkeypatch, signal):
+    """From column 13 and row 6 on: not a multiple of the tile."""
+    asked = []
+    monkeypatch.setattr(slanted_edge, "edge_response", lambda values, used, **_: asked.append((values, used)))
+    monkeypatch.setattr(slanted_edge, "replace", lambda result, **_: result)
+    made = recordings.make("gen2", width=64, height=48, frames=2)
+    frame, layout = made.frames[1], hr.load_sensor("gen2").crop(64, 48).layout
+    tile = made.mosaic.tile_filter
+    name = tile[0][1]
+    measure_mtf(made, 1, (13, 6, 40, 31), signal=signal, filter_name=name)
+    ((values, used),) = asked
+    assert values.shape == used.shape == (31, 40)
+    for i, j in np.ndindex(31, 40):
+        row, col = 6 + i, 13 + j
+        assert used[i, j] == (tile[row % len(tile)][col % len(tile[0])] == name and bool(layout.aps_mask[row, col]))
+    whole = frame.raw if signal == "raw" else frame.electrons_mean
+    np.testing.assert_array_equal(values[used], whole[6:37, 13:53][used])
 
 
 def run(*arguments):

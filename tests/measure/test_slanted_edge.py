@@ -6,7 +6,7 @@ from scipy.special import erf
 
 from hesim_render.core.errors import RangeError
 from hesim_render.measure import edge_response
-from hesim_render.measure.slanted_edge import EdgeResponse
+from hesim_render.measure.slanted_edge import EdgeResponse, _half_width
 
 FREQUENCY = np.linspace(0, 0.5, 51)
 
@@ -115,6 +115,20 @@ def test_frequency_at_a_level_is_that_of_the_first_crossing():
     levels = {0.9: 0.05, 0.5: 0.3, 0.3: 0.4, 0.2: 0.45}
     assert [response.frequency_at(level) for level in levels] == pytest.approx(list(levels.values()))
     assert np.isnan(response.frequency_at(0.05)) and np.isnan(response.frequency_at(1.5))
+
+
+@pytest.mark.parametrize("shape", [(31, 44), (52, 27)])
+@pytest.mark.parametrize("angle_deg", [4.0, 38.0, 81.0, 113.0, 172.0, -66.0])
+def test_the_strip_ends_at_the_corner_next_to_the_edge(shape, angle_deg):
+    """Lines at a smaller distance end at the same two sides as the edge, between pixels of the region."""
+    a, distance = np.radians(angle_deg), 0.9
+    corners = np.array([(y, x) for y in (0, shape[0] - 1) for x in (0, shape[1] - 1)]) - (np.array(shape) - 1) / 2
+    away = np.abs(corners @ [np.sin(a), np.cos(a)] - distance)
+    if away.min() < 4:
+        with pytest.raises(RangeError, match=f"values: {away.min():.2f}"):
+            _half_width(shape, a, distance)
+    else:
+        assert _half_width(shape, a, distance) == pytest.approx(away.min(), rel=1e-12)
 
 
 WRONG = {

@@ -1,5 +1,7 @@
 """Samples of the blocks of long runs, against blocks that are all listed."""
 
+from itertools import islice, pairwise
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,22 @@ def test_the_numbers_of_a_long_run_come_from_a_part_of_it(pieces, rel):
     assert sample.windows == pytest.approx(windows, rel=rel)
     ends = [block.end_us[-1] for block in sample.blocks]
     assert np.all(np.diff(ends) >= -STRETCH_US) and ends[0] < 0.01 * end_us and ends[-1] > 0.99 * end_us
+
+
+@pytest.mark.parametrize(("begin_us", "end_us"), [(5_000, 100_000), (0, 1_239), (1_239, 2_478), (13_000, 13_100)])
+def test_fixed_ticks_after_one_time_and_up_to_another_are_asked_for(begin_us, end_us):
+    """Each once, with its window before it; blocks of whole multiples that overlap by a window."""
+    spec = hr.load_sensor("eiger").spec.evs
+    assert spec.tick_us == 1239 and spec.window_us < 1239
+    blocks = list(islice(tick_blocks(spec, begin_us, end_us), 30))
+    assert len(blocks) < 30
+    wanted = np.concatenate([block.end_us[block.wanted] for block in blocks]) if blocks else np.empty(0)
+    np.testing.assert_array_equal(wanted, [k * 1239 for k in range(1, 99) if begin_us < k * 1239 <= end_us])
+    for before, after in pairwise(blocks):
+        assert before.end_us[-1] == after.end_us[0]
+    for block in blocks:
+        np.testing.assert_array_equal(block.end_us - block.begin_us, spec.window_us)
+        np.testing.assert_array_equal(np.diff(block.end_us), 1239)
 
 
 def test_fixed_ticks_are_sampled_like_instants():

@@ -1,6 +1,7 @@
 """Pictures: neutral stays neutral, colours come out right, no event gets lost, event pixels do not leak in."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -212,3 +213,16 @@ def test_colour_codes_of_ideal_bands():
         assert mosaic.cfa_code(spectra.constant(1.0, *band)) == code
     magenta = spectra.Spectrum(np.array([400, 495, 500, 580, 585, 700.0]), np.array([1, 1, 0, 0, 1, 1.0]))
     assert mosaic.cfa_code(magenta) == 4
+
+
+def test_wider_frames_are_binned_by_as_few_tiles_as_fit(monkeypatch):
+    """1301 px of tiles of 4: four tiles a pixel make it 81 px wide, three would make it 108."""
+    asked = []
+    monkeypatch.setattr(colour_view, "_binned", lambda raw, mosaic, tiles: asked.append(tiles))
+    monkeypatch.setattr(colour_view, "_smoothed", lambda raw, mosaic: asked.append("as it is"))
+    monkeypatch.setattr(colour_view, "_developed", lambda channels, mosaic: np.zeros((1, 1, 3), np.float32))
+    mosaic = SimpleNamespace(tile_shape=(2, 4))
+    for width, most in ((1301, 100), (1200, 100), (101, 100), (100, 100)):
+        colour_picture(np.zeros((6, width), np.uint16), mosaic, most)
+    colour_view.thumbnail(np.zeros((6, 1301), np.uint16), mosaic, 100)
+    assert asked == [4, 3, 1, "as it is", 4]

@@ -237,6 +237,34 @@ def test_the_likelihood_of_counts_is_an_integral_over_the_thresholds(ratio):
         assert log == pytest.approx(np.log(exact), abs=0.03)
 
 
+def test_errors_of_an_s_curve_follow_from_the_scatter_of_scores():
+    """H⁻¹ S H⁻¹ of the likelihood written out, of 150 pixels whose thresholds are no normal law."""
+    rng, sizes, trials = np.random.default_rng(11), np.array([0.09, 0.15, 0.19, 0.22, 0.27, 0.36]), np.full(6, 12.0)
+    own = 0.2 + 0.03 * (rng.exponential(1, 150) - 1)
+    hits = rng.binomial(12, 0.02 + 0.98 * ndtr((sizes - own[:, None]) / 0.035)).astype(float)
+    fit = s_curves._Fit(sizes, hits, trials)
+    values, covariance = fit.values()
+    z = np.linspace(-6, 6, 401)
+
+    def log(moved):
+        theta, sigma, tau, chance = s_curves._natural(moved)
+        share = np.clip(chance + (1 - chance) * ndtr((sizes[:, None] - theta - tau * z) / sigma), 1e-12, 1 - 1e-12)
+        each = hits @ np.log(share) + (trials - hits) @ np.log1p(-share)
+        return np.log(np.exp(each) @ norm.pdf(z) * (z[1] - z[0]))
+
+    steps = np.diag([5e-4, 0.02, 0.03, 0.05])
+    size = np.diag(steps)
+    score = np.stack([(log(values + step) - log(values - step)) / 2 for step in steps], axis=1) / size
+    curve = np.array([[sum(u * v * log(values + u * a + v * b).sum() for u in (1, -1) for v in (1, -1)) / 4
+                       for a in steps] for b in steps]) / np.outer(size, size)  # fmt: skip
+    inverse = np.linalg.inv(-curve)
+    score -= score.mean(axis=0)
+    expected = inverse @ score.T @ score @ inverse
+    error = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), error, rtol=0.1)
+    np.testing.assert_allclose(covariance / np.outer(error, error), expected / np.outer(error, error), atol=0.15)
+
+
 def test_a_ratio_at_its_end_counts_as_known():
     """Pixels without noise: the ratio of noise and spread is at its lower end, and the covariance leaves it out."""
     rng = np.random.default_rng(9)
@@ -245,6 +273,14 @@ def test_a_ratio_at_its_end_counts_as_known():
     values, covariance = fit.values()
     assert values[2] < -5.9 and not covariance[2].any() and not covariance[:, 2].any()
     assert covariance[0, 0] == pytest.approx(0.02**2 / 400, rel=0.3)
+
+
+def test_a_curve_may_be_as_steep_as_two_sizes_are_near():
+    """No jump of 0.2 is answered, and all of 0.2002 are: the width is less than their distance."""
+    sizes = np.array([0.12, 0.17, 0.2, 0.2002, 0.23, 0.3])
+    fit = s_curves._Fit(sizes, np.tile(12.0 * (sizes > 0.2001), (40, 1)), np.full(6, 12.0))
+    values, _ = fit.values()
+    assert 0.2 < values[0] < 0.2002 and np.exp(values[1]) < 1e-4
 
 
 def test_bad_input_is_one_clear_error(tmp_path, numpy_bench):

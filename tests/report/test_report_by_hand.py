@@ -261,9 +261,11 @@ def test_frames_name_the_lights_of_their_figures():
     """Signals of 4 to 99 % of 3000 DN: linearity takes 5 to 95 %, the gain up to 70 %, without unclear levels."""
     signal = np.array([120.0, 160.0, 900.0, 2090.0, 2120.0, 2840.0, 2870.0])
     clear = np.array([True, True, True, True, False, True, True])
-    pairs = SimpleNamespace(has_photons=True, spatial_lit=SimpleNamespace(photons=47.0))
+    pairs = SimpleNamespace(has_photons=True, spatial_lit=SimpleNamespace(photons=47.0), shape=(7, 11))
     result = SimpleNamespace(pairs=pairs, top_dn=3000.0, light=signal * 1.5, clear=clear, signal=signal)
-    lights = emva.FrameFigures(result, {}, []).lights
+    found = emva.FrameFigures(result, {}, [])
+    lights = found.lights
+    assert found.pixels == 77
     assert lights["K"] == "180 to 3140 photons" and lights["linearity_error_percent"] == "240 to 4260 photons"
     assert lights["full_well_e"] == "up to 4300 photons" and lights["prnu_percent"] == "47 photons, and dark"
 
@@ -615,6 +617,8 @@ def test_cycles_with_an_answer_are_counted_after_two_warm_ones():
             (2000, 2, 0, -1), (2539, 2, 1, 1), (2541, 0, 0, 1), (2541, 1, 1, -1)]  # fmt: skip
     bench, good = bench_of(rows, (40, 2560), [0, 0, 1, 1, 2, 5]), np.array([1, 1, 1, 0, 1, 1], bool)
     assert modulated._cycles(bench, modulation()) == (1040.0, 500.0, 3)
+    # a cycle of 300 Hz from 6706.67 to 10,040 µs, whose quotient in double precision is below 1
+    assert modulated._cycles(bench_of(rows, (40, 10_040), [0] * 6), modulation(hz=300.0))[2] == 1
     share = np.array([1, 1, 1, 0, 0, 1]) / 3
     expected = np.full(modulated.GROUPS + 1, share[good].mean())
     for group, left in ((0, [2, 4, 5]), (1, [0, 1, 4, 5]), (2, [0, 1, 2, 5]), (5, [0, 1, 2, 4])):
@@ -627,8 +631,9 @@ def test_cycles_with_an_answer_are_counted_after_two_warm_ones():
     # within 60 µs of 1040 and 1740 µs, of either polarity
     assert modulated._answered(bench, modulation(bursts), good)[0] == pytest.approx(np.mean([0.5, 0, 0, 0, 0]))
     short = bench_of(rows, (40, 1539), [0] * 6)
-    assert np.isnan(modulated._answered(short, modulation(), good)).all()
-    assert not modulated._counts(short, modulation(), good).any()
+    none = modulated._answered(short, modulation(), good), modulated._counts(short, modulation(), good)
+    assert none[0].shape == expected.shape and none[1].shape == (2, *expected.shape)
+    assert np.isnan(none[0]).all() and not none[1].any()
 
 
 def test_the_swing_that_half_answer_lies_between_those_around_it():

@@ -135,6 +135,8 @@ def test_own_responses_are_those_of_the_sensor_where_they_are_the_same():
     grid = np.array([400.0, 450.0, 500.0])
     rectangle = hr.photocurrent(level, grid, sensor, 1e6, filter=name, responses=own, quadrature="rectangle")
     assert rectangle == pytest.approx(50 * level @ own)
+    two = hr.photocurrent(level[:2], grid[:2], sensor, 1e6, filter=name, responses=own[:2], quadrature="rectangle")
+    assert two == pytest.approx(50 * level[:2] @ own[:2])
 
 
 def test_gradients_with_respect_to_radiance_and_responses():

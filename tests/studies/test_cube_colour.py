@@ -1,5 +1,7 @@
 """Colour errors over the pixels of a cube, against a calculation of all pixels at once."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from test_colour_figures import samples_of_tables
@@ -22,6 +24,23 @@ def smooth_cube(rows, cols, seed=1):
     table = np.array([each.at(BANDS) for each in reflectance_set("colorchecker").values()])
     weights = np.random.default_rng(seed).dirichlet(np.full(len(table), 0.3), (rows, cols))
     return (weights @ table).astype(np.float32)
+
+
+def test_a_rendered_cube_has_all_bands_from_the_first_to_the_last(monkeypatch):
+    """Also where (400.7 - 400)/0.1 is below 7 in double precision; 5 px wide and 3 high."""
+    asked = []
+
+    def render(scene, shape, bands, samples):
+        asked.append((scene, shape, bands, samples))
+        return None, np.zeros((*shape, bands.size)), None
+
+    monkeypatch.setattr(cube_colour, "render_cube", render)
+    monkeypatch.setattr(cube_colour, "load_scene", lambda file: file)
+    item = SimpleNamespace(scene="s", beside=lambda name: name, bands_nm=(400.0, 400.7, 0.1), size_px=(5, 3), samples=7)
+    cube = cube_colour.open_surfaces(item)
+    ((scene, shape, bands, samples),) = asked
+    assert (scene, shape, samples) == ("s", (3, 5), 7) and cube.shape == (3, 5, 8)
+    np.testing.assert_allclose(bands, 400 + 0.1 * np.arange(8))
 
 
 def responses():

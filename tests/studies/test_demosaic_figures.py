@@ -1,11 +1,14 @@
 """Patterns and figures after demosaicing: closed forms, a mosaic without loss, and orders that must hold."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import hesim_render as hr
 from hesim_render.core.errors import RangeError
 from hesim_render.measure import edge_response
+from hesim_render.spectral.spectrum import illuminant
 from hesim_render.studies import demosaic_figures
 from hesim_render.studies.demosaic_figures import DARK, LIGHT, _figures, zipper
 
@@ -28,6 +31,41 @@ def test_patterns_are_means_over_pixels():
     expected = 0.5 * np.cos(np.pi * demosaic_figures.ZONE_TOP / (side / 2) * x**2)
     np.testing.assert_allclose(row[:20], expected[:20], atol=0.03)
     assert demosaic_figures.chart().shape == (side, 3 * side) and all(side % size == 0 for size in (2, 4, 6))
+
+
+def test_spokes_and_rings_are_where_their_angle_and_distance_say():
+    """Pixel by pixel, away from the sides of the sectors; rows run downwards, as the angle does from the columns on."""
+    side, spokes = demosaic_figures.SIDE_PX, demosaic_figures.SPOKES
+    y, x = np.mgrid[:side, :side] - (side - 1) / 2
+    radius, phase = np.hypot(x, y), spokes * np.arctan2(y, x)
+    whole = np.abs(np.sin(phase)) * radius / spokes > 0.8  # the pixel's corners are 0.71 px from its centre
+    np.testing.assert_array_equal(demosaic_figures.star()[whole], (np.sin(phase) > 0)[whole])
+    zone, frequency = demosaic_figures.zone_plate_picture(), demosaic_figures.ZONE_TOP * radius / (side / 2)
+    rate = np.pi * demosaic_figures.ZONE_TOP / (side / 2)
+    slow = frequency < 0.15
+    box = np.sinc(2 * rate * x / (2 * np.pi)) * np.sinc(2 * rate * y / (2 * np.pi))
+    np.testing.assert_allclose(zone[slow], 0.5 + 0.5 * (box * np.cos(rate * radius**2))[slow], atol=0.01)
+
+
+def test_false_colour_is_counted_along_the_edge(monkeypatch):
+    """A red tint on both sides of it counts up to 4 px away, each pixel as much, and is compared beyond 16 px."""
+    monkeypatch.setattr(demosaic_figures, "edge_response", lambda _: SimpleNamespace(frequency_at=lambda _: 0.5))
+    monkeypatch.setattr(demosaic_figures, "zipper", lambda *_: 0.0)
+    side = demosaic_figures.SIDE_PX
+    reflectance = DARK + (LIGHT - DARK) * demosaic_figures.chart()
+    a = np.radians(demosaic_figures.EDGE_DEG)
+    y, x = np.mgrid[:side, :side] - (side - 1) / 2
+    distance = np.abs(x * np.cos(a) + y * np.sin(a))
+
+    def tinted(begin, end):
+        rgb = np.repeat(reflectance[..., None], 3, axis=2)
+        rgb[:, :side][(distance >= begin) & (distance < end)] *= [1.3, 1.0, 0.9]
+        return _figures(rgb, reflectance)["false_colour"]
+
+    whole = tinted(0, 4.8)
+    assert whole > 5
+    np.testing.assert_allclose([tinted(0, 2), tinted(1, 3), tinted(0, 15)], [whole / 2, whole / 2, whole], rtol=0.04)
+    assert abs(tinted(4.8, 15)) < 1e-9 and tinted(17, 99) == pytest.approx(-whole, rel=0.04)
 
 
 def test_a_perfect_picture_has_perfect_figures():
@@ -58,6 +96,20 @@ def test_zipper_counts_pixels_that_differ_from_their_true_likes():
     assert 100 / 49 <= found <= 900 / 49
     picture[4, 2] = true[4, 2] + [0, 2, 0]
     assert zipper(picture, true, every) == 0  # below the threshold
+
+
+def test_a_picture_with_noise_has_the_levels_of_the_chart(monkeypatch):
+    """Dark current of as many electrons as white: its mean is taken off, whatever the exposure and the gain are."""
+    monkeypatch.setattr(demosaic_figures, "_figures", lambda *_: {})
+    sensor = hr.load_sensor("reference-bayer", {"aps.dark_current_e_per_s": 4e5, "aps.exposure_us": 7_000})
+    figures, picture = demosaic_figures.demosaic_figures(
+        sensor, illuminant("D65"), np.eye(3), np.full(3, 2900.0), np.full(3, 2900.0), 7_000.0, 0.0, 1, 3
+    )
+    chart = DARK + (LIGHT - DARK) * demosaic_figures.chart()
+    inner = np.s_[20:-20, 20:-20]
+    # shot noise of 5700 electrons and less, 75 of 2900, over 80,000 pixels
+    assert picture[inner].mean() == pytest.approx(chart[inner].mean(), abs=1e-3)
+    assert 0.01 < figures["picture_error_simulated"] < 0.2
 
 
 def test_mosaics_cost_what_their_sampling_says():

@@ -1,5 +1,6 @@
 """Design of filters: families against other programs, cost and gradients against central differences on float64."""
 
+import itertools
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -272,6 +273,32 @@ def test_shares_become_whole_pixels_that_lie_apart():
     assert held[1, 2] == "w" and "x" not in held
 
 
+def test_no_exchange_of_two_pixels_spreads_a_tile_more():
+    """Of a tile of 3 × 5 px with two that stay: repulsion of equal letters over 25 repetitions, pair by pair."""
+    letters = np.full((3, 5), "x")
+    letters[0, 3], letters[2, 1] = "w", "v"
+    free = [(i, j) for i, j in np.ndindex(3, 5) if letters[i, j] == "x"]
+    tile = spread_tile(letters, letters == "x", {"R": 4, "G": 6, "B": 3})
+    assert tile[0, 3] == "w" and tile[2, 1] == "v" and (tile == "G").sum() == 6
+
+    def energy(given):
+        total = 0.0
+        for a in free:
+            for b in free:
+                if a != b and given[a] == given[b]:
+                    for i in range(-2, 3):
+                        for j in range(-2, 3):
+                            square = (a[0] - b[0] + 3 * i) ** 2 + (a[1] - b[1] + 5 * j) ** 2
+                            total += np.exp(-square / (2 * 1.2**2))
+        return total
+
+    least = energy(tile)
+    for a, b in itertools.combinations(free, 2):
+        other = tile.copy()
+        other[a], other[b] = tile[b], tile[a]
+        assert energy(other) > least - 1e-3  # what lies farther than one repetition is not counted there
+
+
 def test_a_design_of_shares_ends_in_a_tile_of_its_own(tmp_path):
     """Noise alone: the share of a filter follows from its electrons and its part in the matrix."""
     spec = {**SMALL, "tile_px": [4, 4], "silicon_depth_um": [2.0, 4.0], "steps": 8, "demosaic": False,
@@ -338,6 +365,30 @@ def test_every_family_lowers_the_cost_within_its_constraints(family):
         assert curve.min() >= 0.02 - 1e-9 and curve.max() <= 0.95 + 1e-6
         # the penalty is soft: a tenth above at most
         assert np.abs(np.diff(curve)).max() / 5 < 0.022 if family != "thin_film" else True
+
+
+def test_slopes_above_the_largest_cost_their_square():
+    """Of 94 steps of 5 nm, 20 rise 1.5 times as fast as allowed and 7 fall 3 times as fast; others are as allowed."""
+    problem = Problem.__new__(Problem)
+    problem.spec = SimpleNamespace(slope_max_per_nm=0.002)
+    assert DESIGN_NM.size == 95 and np.all(np.diff(DESIGN_NM) == 5)
+    slopes = np.zeros(94)
+    slopes[3:23], slopes[40:47], slopes[60:75] = 0.003, -0.006, 0.00199
+    curve = 0.3 + np.append(0, np.cumsum(5 * slopes))
+    found = problem._steepness(jit().Float64(curve))[0]
+    assert found == pytest.approx(1000 * (20 * 0.5**2 + 7 * 2.0**2) / 94, rel=1e-9)
+
+
+def test_a_design_starts_with_its_depth_and_shares_as_parts_of_their_ranges():
+    """Depth 1.6 of 1 to 3.5 µm. Shares above the least one, 0.1, over the largest of them: 8, 5 and 3 of 16 pixels."""
+    problem = Problem.__new__(Problem)
+    problem.spec = SimpleNamespace(silicon_depth_um=(1.0, 3.5), tile_px=(4, 4), share_min=0.1)
+    problem._start_depth_um, problem.frames = 1.6, ["g", "r", "b"]
+    problem.tile = lambda rows, cols: (np.array(list("GGGGGGGGRRRRRBBB")).reshape(4, 4), np.ones((4, 4), bool))
+    problem.filter_set = SimpleNamespace(pixels={name.upper(): SimpleNamespace(filter=name) for name in "grb"})
+    depth, shares = problem._other_starts()
+    np.testing.assert_allclose(depth, [0.6 / 2.5])
+    np.testing.assert_allclose(shares, np.array([0.4, 5 / 16 - 0.1, 3 / 16 - 0.1]) / 0.4)
 
 
 def test_fresh_parameters_compile_nothing():

@@ -183,3 +183,19 @@ def test_charts_that_do_not_fill_their_rows_show_every_patch():
     chart = chart_noise.noisy_chart(sensor, filters, told, 20_000, repeats=3, patch_px=23)
     assert chart.channels.shape == (3, 5, 144, 3) and chart.tile_px == 4
     np.testing.assert_allclose(chart.channels.mean(axis=(0, 2)), patch_e, atol=10)
+
+
+def test_tiles_at_the_rim_of_a_patch_are_left_out_where_pixels_share_their_light():
+    """Crosstalk of 0.4: a pixel keeps 0.6 and has a tenth of each of its four neighbours, all of its own patch."""
+    sensor, filters = hr.load_sensor("reference-bayer"), ["red", "green", "blue"]
+    patch_e = np.array([[900.0, 1300.0, 500.0], [5200.0, 3100.0, 7700.0], [40.0, 90.0, 60.0]])
+    order = [sensor.layout.filters.index(name) for name in filters]
+    given = np.empty_like(patch_e)
+    given[:, order] = patch_e
+    red, green, blue = patch_e.T
+    expected = np.stack([0.6 * red + 0.4 * green, 0.6 * green + 0.2 * (red + blue), 0.6 * blue + 0.4 * green], axis=-1)
+    for side, tiles, even in ((23, 100, True), (5, 1, True), (4, 4, False)):  # of 12 × 12, 3 × 3 and 2 × 2
+        chart = chart_noise.noisy_chart(sensor, filters, given, 20_000, repeats=40, patch_px=side, crosstalk=0.4)
+        assert chart.channels.shape == (40, 3, tiles, 3)
+        off = np.abs(chart.channels.mean(axis=(0, 2)) / expected - 1)
+        assert (off.max() < 0.05) == even

@@ -128,10 +128,12 @@ def test_points_are_those_of_the_drawn_boards():
     w, h = board.pattern_m
     expected = of_opencv * [1, -1, 1] + [-w / 2, h / 2, 0]
     np.testing.assert_allclose(target_points(board), expected, atol=1e-7)  # OpenCV has float32
-    grid = board_scene({"type": "aprilgrid", "rows": 2, "cols": 2, "tag_m": 0.05, "spacing": 0.2}).spec.target
-    corners = target_points(grid).reshape(4, 4, 3)
-    np.testing.assert_allclose(corners[0], [[-0.055, -0.055, 0], [-0.005, -0.055, 0], [-0.005, -0.005, 0],
-                                            [-0.055, -0.005, 0]], atol=1e-12)  # fmt: skip
+    grid = board_scene({"type": "aprilgrid", "rows": 2, "cols": 3, "tag_m": 0.05, "spacing": 0.2}).spec.target
+    corners = target_points(grid).reshape(6, 4, 3)
+    # the middle tag of the upper row is centred, 1.2 tags right of the first one; counter-clockwise from the lower left
+    for number, (x, y) in {0: (-0.085, -0.055), 4: (-0.025, 0.005)}.items():
+        expected = [[x, y, 0], [x + 0.05, y, 0], [x + 0.05, y + 0.05, 0], [x, y + 0.05, 0]]
+        np.testing.assert_allclose(corners[number], expected, atol=1e-12)
     with pytest.raises(SpecError, match="a target of type 'flat' has no calibration points"):
         target_points(hr.load_scene("flat-field").spec.target)
 
@@ -144,6 +146,12 @@ def test_boards_that_cannot_be_drawn_are_refused(monkeypatch):
         with pytest.raises(SpecError) as caught:
             build_target(board_scene({**CHARUCO, **wrong}).spec.target)
         assert told in str(caught.value)
+    # 587 tags of the family: a grid of 2 × 3 ends with its last one, or one beyond; so does a board of 17 markers
+    grid = {"type": "aprilgrid", "rows": 2, "cols": 3, "tag_m": 0.05}
+    for board, last in ((grid, 581), ({"type": "charuco", "rows": 5, "cols": 7, "dictionary": "DICT_4X4_50"}, 33)):
+        build_target(board_scene({**board, "first_id": last}).spec.target)
+        with pytest.raises(SpecError, match=r"has \d+ markers, and this board needs number \d+"):
+            build_target(board_scene({**board, "first_id": last + 1}).spec.target)
     import sys
 
     monkeypatch.setitem(sys.modules, "cv2", None)

@@ -9,6 +9,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.specs.target import TargetSpec
 from hesim_render.spectral.spectrum import Spectrum
 from hesim_render.targets.build import build_target, placed_pieces
+from hesim_render.targets.piece import Picture, bent, picture_piece
 from hesim_render.targets.points import target_points
 
 TARGETS = [
@@ -115,19 +116,26 @@ def test_slanted_edge_leans_clockwise_and_star_spokes_are_dark_from_the_x_axis()
     np.testing.assert_allclose(value, np.where(np.arange(8) % 2 == 0, 0.05, 0.8))
     outside, _ = value_at(star, np.array([0.095]), np.array([0.093]))
     assert outside == [0.8]
+    for width, height in ((0.26, 0.18), (0.18, 0.31)):
+        star = build_target(target_of({"type": "siemens-star", "spokes": 4, "width_m": width, "height_m": height}))
+        for radius, value in ((0.0899, np.where(np.arange(8) % 2 == 0, 0.05, 0.8)), (0.0901, 0.8)):
+            found, _ = value_at(star, radius * np.cos(angle), radius * np.sin(angle))
+            inside = (abs(radius * np.cos(angle)) < width / 2) & (abs(radius * np.sin(angle)) < height / 2)
+            np.testing.assert_allclose(found[inside], np.broadcast_to(value, 8)[inside])
 
 
 def test_squares_of_an_edge_field_are_turned_clockwise_about_the_middles_of_their_cells():
-    content = {"type": "edge-field", "rows": 2, "cols": 2, "angle_deg": [10, -20], "fill": 0.6, "height_m": 0.3}
+    content = {"type": "edge-field", "rows": 2, "cols": 3, "angle_deg": [10, -20], "fill": 0.6, "width_m": 0.36,
+               "height_m": 0.2}  # fmt: skip
     target = target_of(content)
-    x, y = np.random.default_rng(2).uniform(-0.15, 0.15, (2, 3000))
+    x, y = np.random.default_rng(2).uniform(-0.5, 0.5, (2, 3000)) * [[0.36], [0.2]]
     value, _ = value_at(build_target(target), x, y)
-    u, v = np.mod(x, 0.15) - 0.075, np.mod(y, 0.15) - 0.075
-    number = (y < 0) * 2 + (x > 0)
+    u, v = np.mod(x + 0.18, 0.12) - 0.06, np.mod(y, 0.1) - 0.05
+    number = (y < 0) * 3 + np.floor((x + 0.18) / 0.12)
     angle = np.radians(np.where(number % 2 == 0, 10, -20))
     # the turned axes of a square: its upright side leans to the right for a positive angle
     own_x, own_y = u * np.cos(angle) - v * np.sin(angle), u * np.sin(angle) + v * np.cos(angle)
-    dark = (abs(own_x) < 0.045) & (abs(own_y) < 0.045)
+    dark = (abs(own_x) < 0.03) & (abs(own_y) < 0.03)
     np.testing.assert_array_equal(value == 0.2, dark)
 
 
@@ -181,6 +189,25 @@ def test_targets_are_bent_then_turned_then_moved():
         assert np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2].min() > 0
     with pytest.raises(SpecError, match=r"more than half a cylinder of this radius; it must be 0.09549 m or more"):
         build_target(target_of({**flat, "bend_radius_m": 0.09}))
+
+
+def test_places_on_a_bent_picture_are_those_of_the_flat_one():
+    """Unrolled, each strip lies between its lines, has its place in the picture, and together they are the whole."""
+    width, height, radius, step = 0.31, 0.17, 0.11, 0.023
+    flat = picture_piece("p", Picture(np.zeros((2, 3, 1), np.float32), "grey"), width, height, (0.2, 0.7, 0.1, 0.4))
+    found = bent(flat, radius, step)
+    x, y, z = found.vertices_m.T
+    along = radius * np.arctan2(x, radius - z)
+    np.testing.assert_allclose(found.uv[:, 0], 0.2 + 0.5 * (along / width + 0.5), atol=1e-9)
+    np.testing.assert_allclose(found.uv[:, 1], 0.1 + 0.3 * (y / height + 0.5), atol=1e-9)
+    strips = np.stack([along, y], axis=1)[found.faces.astype(int)]
+    one, other = strips[:, 1] - strips[:, 0], strips[:, 2] - strips[:, 0]
+    area = (one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]) / 2
+    assert area.min() > 0 and area.sum() == pytest.approx(width * height, rel=1e-9)
+    place = strips[..., 0] / step
+    assert np.all(np.ceil(place.max(axis=1) - 1e-9) - np.floor(place.min(axis=1) + 1e-9) == 1)
+    # 14 strips of two triangles, each cut into a part of 3 or 4 corners
+    assert len(strips) <= 14 * 2 * 2
 
 
 def test_a_zone_plate_has_the_stated_frequency():

@@ -286,7 +286,7 @@ def _unresponsive(composite: Composite, tile: tuple[int, int]) -> NDArray[np.boo
     for i, j in np.ndindex(tile):
         rate = composite.rate_dn_per_s[i :: tile[0], j :: tile[1]]
         error = composite.standard_error_dn_per_s[i :: tile[0], j :: tile[1]]
-        # the third lowest of the nine: two dead neighbours do not make a pixel look alive
-        around = rank_filter(np.nan_to_num(rate, nan=0.0), 2, size=3)
+        # the third lowest of the nine: a dead neighbour does not make a pixel look alive, nor does itself beyond a rim
+        around = rank_filter(np.nan_to_num(rate, nan=0.0), 2, size=3, mode="mirror")
         unresponsive[i :: tile[0], j :: tile[1]] = (rate < 0.02 * around) & (around - rate > 10 * error)
     return unresponsive
