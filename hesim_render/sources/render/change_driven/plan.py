@@ -72,7 +72,7 @@ class Plan:
     differences : pairs that are rendered as differences to another window.
     fitted : rendered pairs in which lines are fitted, to follow edges from one to the next; see `edge_courses`.
     barred : pairs between which no edge is followed.
-    asked : rendered pairs that show no change by themselves: their neighbours ask for them.
+    asked : rendered pairs that show no change by themselves, for which neighbours ask; none where no edge is followed.
     pilot : flux of the pilot, e⁻/s.
     aims : small objects at which rays are aimed, by window and site; None if there are none.
     """
@@ -180,7 +180,8 @@ def plan(
             near = sites.most(large[window], 1) | sites.most(extreme[window], 2)
             own = marked[window][sites.listed]
             out.rendered[window] = own | near
-            out.asked[window] = near & ~own
+            # from one tick to the next an edge goes too far for a pair to keep the flux of an earlier one
+            out.asked[window] = near & ~own & follows
         if pilot.refined:
             # an object that passes within a window or two does not change the flux linearly
             looked_at = np.zeros(flux.shape, np.bool_)
