@@ -1,5 +1,6 @@
 """Looks with many rays at sites in deep shadow: where, in which windows, and what a run is worth with them."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from unittest import mock
 
@@ -61,7 +62,7 @@ def looked(count=17, near=True, **sites):
     numbers = np.repeat(np.arange(count)[:, None] + FIRST, INDEX.size, axis=1)
     near = np.ones(INDEX.size, np.bool_) & near
     given = Sites.alone(INDEX), numbers, Windows(begin, begin + 1000), (seen, unshadowed), near, wanted_error, 1.4
-    return tracer, deep_shadow(tracer, *given, TUNING)
+    return tracer, deep_shadow(tracer, *given, replace(TUNING, deep_looks=9))
 
 
 @pytest.mark.parametrize(("count", "looks"), [
@@ -112,6 +113,8 @@ def test_one_look_at_deep_shadow_is_enough():
     dark = np.arange(17) < 8
     assert looked(s3=(np.where(dark, SEEN, OPEN), np.where(dark, 8100, OPEN)))[1] is None
     assert looked(s3=(np.where(dark, SEEN, OPEN), np.where(dark, 8300, OPEN)))[1] is not None
+    # by the error that is wanted in this window
+    assert looked(s3=(np.where(dark, OPEN, 100), np.where(dark, OPEN, 4200)))[1] is not None
 
 
 # ---- where it is done ---------------------------------------------------------------------------
@@ -240,9 +243,9 @@ def test_pixels_in_deep_shadow_follow_their_light():
     assert truth[2, dark] == 0 and truth[-1, dark] > 25 * unit[-1, dark]
     np.testing.assert_allclose(none[:14, dark], none[13, dark] * np.arange(1, 15) / 14, rtol=1e-5)
     # 60 sites, 32 of them listed
-    deep = (256, Stream.RENDER_ZOOM, 9 * 60)
+    deep = (256, Stream.RENDER_ZOOM, TUNING.deep_looks * 60)
     assert calls.count(deep) == 1 and deep not in without
-    assert source.counts.pilot_rays > other.counts.pilot_rays + 9 * 60 * 256 // 2
+    assert source.counts.pilot_rays > other.counts.pilot_rays + TUNING.deep_looks * 60 * 256 // 2
 
 
 def test_sensors_without_gaps_take_no_such_looks():

@@ -164,7 +164,16 @@ def test_the_levels_of_a_line_are_compared_with_nothing():
     assert not two(near, far)
     # nor with levels of an even pixel
     assert not two(near, even(310, 335)) and not two(even(310, 335), near)
-    # which hold all the same, where all of it is within a wanted error
+    # nor with intervals of 6 e⁻/s that meet: together they are 12 wide, though each end is within 9 of the other's
+    below, above = (line(offset, gap=6 / (30 * CHORD), low=310, high=340) for offset in (-0.1, -0.1 + 6 / (30 * CHORD)))
+    middle = 325 - 0.1 * 30 * CHORD
+    for other in (above, even(middle + 3, middle + 9)):
+        assert not two(below, other) and not two(other, below)
+    assert two(even(middle - 3, middle + 3), even(middle + 3, middle + 9))
+    # a side of one ray is no edge
+    single = line(-0.3, low=312, high=337) | {"fewer": 1}
+    assert two(single, even(310, 335)) and two(even(310, 335), single)
+    # levels hold all the same, where all of it is within a wanted error
     dim = line(-0.3, low=310, high=318)
     assert two(dim, even(311, 317)) and two(even(311, 317), dim)
 
