@@ -155,6 +155,12 @@ def test_pixels_that_lie_apart_are_looked_at_in_a_block(monkeypatch, apart, wind
     assert own.counts.pilot_rays == 70 + (3000 if is_looked_at else 0)
 
 
+@pytest.mark.parametrize(("name", "has_ticks"), [("gen2", True), ("davis346", False), ("imx264", True)])
+def test_windows_without_a_tick_are_not_all_looked_at(name, has_ticks):
+    source = ChangeDrivenFlux(lamp_behind_a_plate(), hr.load_sensor(name).crop(16, 8), seed=4)
+    assert source.has_ticks == has_ticks and source._renderer.look_stride == (1 if has_ticks else TUNING.look_stride)
+
+
 @pytest.mark.parametrize("follows", [True, False])
 def test_changes_of_deep_shadow_are_rendered(follows):
     """Of 7×5 sites on a lattice that lie apart, 3×3 are listed; the pilot of all sees no change but in one of them."""
