@@ -12,7 +12,7 @@ import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.rng import Stream
 from hesim_render.mosaic.schedule import Block
-from hesim_render.sources.render.change_driven import adaptive, event_blocks
+from hesim_render.sources.render.change_driven import adaptive
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.differences import Differences
 from hesim_render.sources.render.change_driven.edge_courses import Courses
@@ -440,7 +440,7 @@ def test_held_windows_are_knots_and_the_ends_of_courses():
     """Pixel 0: an edge is followed from window 3, which is held of window 1, to window 6. Pixel 1: window 4 is held of
     window 2. Everything else lies on straight lines.
     """
-    centre = np.array([50.0, 90, 150, 180, 260, 300, 390, 450])
+    centre = 220_000 + 80 * np.array([50.0, 90, 150, 180, 260, 300, 390, 450])
     block = Block(centre - 3, centre + 3, np.arange(8) > 0)
     rendered = np.zeros((8, 2), np.bool_)
     rendered[[0, -1]] = rendered[[1, 6], 0] = rendered[[2, 6], 1] = True
@@ -460,9 +460,10 @@ def test_held_windows_are_knots_and_the_ends_of_courses():
     blocks = Blocks.__new__(Blocks)
     blocks._renderer = renderer
     blocks._bands = [SimpleNamespace(place=np.arange(2), sites=SimpleNamespace(size=2))]
-    span_us = event_blocks.anchor_us(block.begin_us, block.end_us, False)
+    # compared with the last multiple of 64 ms, though the block is longer than 16 ms
+    span_us = 191_994.0, 192_000.0
     blocks._anchors = [SimpleNamespace(span_us=span_us, pilot=None, render=lambda *_: None)]
-    blocks._time, blocks._last = (47.0, 53.0), Flux.zeros(1, 2)
+    blocks._time, blocks._last = (centre[0] - 3, centre[0] + 3), Flux.zeros(1, 2)
     got = blocks.take(block)
     for number, values in enumerate(before.arrays):
         ends = values[1, 0] + (centre - centre[3]) / (centre[6] - centre[3]) * (values[6, 0] - values[1, 0])
@@ -474,6 +475,22 @@ def test_held_windows_are_knots_and_the_ends_of_courses():
         second = np.interp(centre, centre[list(knots)], list(knots.values()))
         seen = np.array([got.at(window).arrays[number][0] for window in range(8)])
         np.testing.assert_allclose(seen, np.stack([first, second], axis=1), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("has_ticks", "end_us"), [(False, 192_000), (True, 128_000)])
+def test_a_run_begins_with_the_anchor_of_its_first_block(has_ticks, end_us):
+    """At a multiple of 64 ms, or of four blocks of 32 ms where these are of ticks."""
+    times = 220_000 + np.linspace(0, 32_000, 5)
+    seen = []
+    renderer = SimpleNamespace(
+        has_ticks=has_ticks, counts=SimpleNamespace(values=0),
+        alone=lambda pixel, begin, end, *_, keep: (seen.append((begin, end, keep)), [])[1],
+        still=lambda role: SimpleNamespace(known=np.ones(9, np.bool_)),
+    )  # fmt: skip
+    blocks = Blocks(renderer, np.array([2, 5], np.uint32), Block(times - 70, times, np.ones(5, np.bool_)))
+    [(begin, end, keep)] = seen
+    assert blocks.alive.size == 0 and keep == (219_930, 252_000)
+    assert begin.tolist() == [end_us - 70] * 2 and end.tolist() == [end_us] * 2
 
 
 # ---- runs ----------------------------------------------------------------------------------------
