@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
+from hesim_render.capture.loop import Capture
+from hesim_render.capture.run_settings import noise_models
+from hesim_render.mosaic import schedule
 from hesim_render.mosaic.schedule import blocks_of_run, exposures, instant_blocks, sample_of_blocks, tick_blocks
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
 #: 16 cells of 1 ms.
 STRETCH_US = 16_000
@@ -90,6 +94,20 @@ def test_fixed_ticks_are_sampled_like_instants():
     assert begin_us + length_us - part_us < sample.blocks[-1].end_us[-1] <= begin_us + length_us
     assert sample.count == pytest.approx(length_us / stretch_us)
     assert sample.windows == pytest.approx(length_us / spec.tick_us)
+
+
+@pytest.mark.parametrize(("name", "length_us"), [("davis346", 32_000), ("reference-mono", 16 * 2000)])
+def test_a_stretch_of_a_capture_is_a_block(monkeypatch, name, length_us):
+    """6.4 s in which hardly anything moves, of which 64 stretches are listed: blocks of 32 cells, or of 16 ticks."""
+    monkeypatch.setattr(schedule, "_STRETCHES", 64)
+    sensor = hr.load_sensor(name, {"evs.tick_us": 2000} if name == "reference-mono" else {}).crop(2, 2)
+    keys = [{"t_us": 0, "rotation_deg": 0}, {"t_us": 70_000_000, "rotation_deg": 1}]
+    scene = hr.load_scene("rotating-star", {"motion": [{"object": "target", "keyframes": keys}]})
+    source = ChangeDrivenFlux(scene, sensor, seed=4)
+    capture = Capture(source, source.sensor, *noise_models(sensor), 6_400_000, 5)
+    sample = capture.sample_of_event_blocks()
+    assert sample.share == pytest.approx(64 * length_us / 6.4e6) and len(sample.blocks) == 64
+    assert sample.count == pytest.approx(6.4e6 / length_us)
 
 
 def test_a_frame_ends_with_its_last_row():
