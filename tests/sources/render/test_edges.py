@@ -186,15 +186,10 @@ def test_a_line_depends_on_its_pair_alone(edges):
 
 
 def test_pairs_of_little_contrast_take_half_of_the_decision_rays(edges):
-    """32 rays where these show too little; 64 where they show more, and 128 where there is a line in the pixel."""
+    """32 rays where these show too little; 64 where they show more, and 128 where there is a line."""
     tracer, pairs, controlled, _ = edges
     every = tracer.edges(*pairs, 64, 1.5, controlled, np.zeros(controlled.size, np.float32))
-    assert set(every.rays.tolist()) == {64, 128}
-    # a line with 64 rays has all corners of the pixel on one side, wherever in its gap it lies
-    corners = [every.normal_x * x + every.normal_y * y + every.offset for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
-    beside = (np.min(corners, axis=0) >= every.gap / 2) | (np.max(corners, axis=0) <= -every.gap / 2)
-    assert np.all(beside[every.is_edge & (every.rays == 64)])
-    assert 10 < np.count_nonzero(every.is_edge & (every.rays == 64)) < np.count_nonzero(every.rays == 128)
+    assert set(every.rays.tolist()) == {64, 128} and every.is_edge[every.rays == 64].sum() == 0
     contrast = every.high - every.low
     least = np.where(np.arange(controlled.size) % 3 == 0, 1.5, 0.2).astype(np.float32) * contrast
     done = tracer.rays_done
