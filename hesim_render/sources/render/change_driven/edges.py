@@ -122,12 +122,6 @@ class EdgeFit:
         """True where a line separates two even levels."""
         return self.is_line & (self.fewer >= _LEAST_ON_A_SIDE)
 
-    @property
-    def may_cross(self) -> NDArray[np.bool_]:
-        """True where the line may lie inside of the pixel at some time of the window."""
-        reach = np.abs(self.normal_x) + np.abs(self.normal_y) + np.maximum(self.gap, 0) + np.abs(self.speed)
-        return 2 * np.abs(self.offset) < reach
-
     def at(self, part: NDArray) -> EdgeFit:
         """Fits of some pairs."""
         return EdgeFit(*(values[part] for values in astuple_of(self)))

@@ -181,7 +181,7 @@ class PairTracer(PacketTracer):
         ----------
         pixel, window, windows, controlled, stream : see `trace`.
         samples : rays per pair, a power of two, at least twice `LEAST_SAMPLES`; half as many where the first half shows
-            little contrast, and twice as many where there is a line in the pixel.
+            little contrast, and twice as many where there is a line.
         footprint_px : width of the area in which these rays start, pixels.
         least : [n], contrast below which it is little, e⁻/s on the optical axis.
         moves : True where lines may move within the windows.
@@ -254,8 +254,7 @@ class PairTracer(PacketTracer):
             both = joined_rays(first, uneven, decision_rays(uneven, half, 1), half)
             better = EdgeFit.empty(uneven.size)
             better.put(slice(None), both, samples, moves)
-            # a line beside the pixel says enough
-            lines = np.flatnonzero(better.is_line & better.may_cross)
+            lines = np.flatnonzero(better.is_line)
             if lines.size:
                 refined = EdgeFit.empty(lines.size)
                 more = decision_rays(uneven[lines], samples, 2, better.models(lines, wider=True))
