@@ -69,7 +69,7 @@ def held_pairs(
     """
     count, pixels = asked.shape
     # where all rays see the same, none is above the middle, and the higher level is 0
-    high, gap = np.maximum(fit.high, fit.low), np.float32(0.5) * np.maximum(fit.gap, 0)
+    high, gap = np.maximum(fit.high, fit.low), np.float32(0.5) * fit.gap
     contrast = high - fit.low
     # least and largest flux that the decision rays allow, [k]: an edge lies anywhere in its gap, and its sides scatter
     least, most = (
