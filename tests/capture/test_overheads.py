@@ -50,7 +50,7 @@ def test_steps_go_to_windows_and_to_nodes_of_the_noise():
 def test_an_audit_costs_rays_at_the_speed_of_the_run():
     for name, most in (("imx636", 24e6), ("eiger", 8e6), ("reference-bayer", 8e6)):
         for rays in (Estimate(0.5, 7e8, 4e5), RAYS, Estimate(900.0, 7e8, 3e9)):
-            again = min(8 * rays.rays, max(most, rays.rays / 8)) / rays.rays * rays.seconds
+            again = min(8 * rays.rays, max(most, rays.rays / 16)) / rays.rays * rays.seconds
             assert told(name, rays, audited=True) - told(name, rays) == pytest.approx(0.5 + again)
     # what stands still has few values to look at again
     still = told("eiger", audited=True, rests=True) - told("eiger", rests=True)
