@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, UInt32
 from hesim_render.core.tables import spread_out, table
 from hesim_render.sources.render.change_driven.edges import PairEdges
@@ -175,8 +176,6 @@ class _Square:
     @property
     def density(self) -> Float:
         """Of a point drawn uniformly inside, 1/pixel; 0 if the square does not meet the area."""
-        import drjit as dr
-
         area = dr.maximum(self.wide, 0) * dr.maximum(self.high, 0)
         return dr.select(area > 0, dr.rcp(area), 0)
 
@@ -194,8 +193,6 @@ class Aim:
     """
 
     def __init__(self, parts: MovingScene, rays: RayFactory) -> None:
-        import drjit as dr
-
         self._parts, self._rays = parts, rays
         self._balls = table(jit().Float, np.array([ball_around(group) for group in parts.groups] or [(0.0,) * 4]))
         dr.make_opaque(self._balls)
@@ -205,8 +202,6 @@ class Aim:
 
         One random number decides both, so that the instants of the rays of each object are stratified.
         """
-        import drjit as dr
-
         scaled = moment * lanes.count
         slot = dr.minimum(type(lanes.count)(scaled), lanes.count - 1)
         return slot, dr.select(lanes.is_aimed, scaled - slot, moment)
@@ -233,8 +228,6 @@ class Aim:
         uniform : places of rays that are not aimed, pixels from the centre.
         point : [0, 1)², place inside the square of an aimed ray.
         """
-        import drjit as dr
-
         types = jit()
         # an aimed ray: a point of the square around its object, at its own instant
         own = self._square(dr.gather(types.UInt32, lanes.group, lanes.first + slot), now, camera, centre)
@@ -258,8 +251,6 @@ class Aim:
 
     def _square(self, group: UInt32, now: Moment, camera: DevicePose | None, centre: tuple[Float, Float]) -> _Square:
         """Square around the image of the ball around an object, cut to the pixel's area."""
-        import drjit as dr
-
         types = jit()
         ball = dr.gather(types.Array4f, self._balls, group)
         middle = self._parts.pose(group, now).to_world(types.Array3f(ball.x, ball.y, ball.z))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.tables import table
 
@@ -24,8 +25,6 @@ def widest_gap(x: Float, y: Float, side: Float, rays: int) -> tuple[Float, Float
 
     A search over directions in steps that become finer; in each direction, all rays of the pair are projected.
     """
-    import drjit as dr
-
     types = jit()
     projected = _Projected(x, y, dr.zeros(types.Float, len(side)), side, rays)
 
@@ -65,8 +64,6 @@ class _Projected:
     """
 
     def __init__(self, x: Float, y: Float, time: Float, side: Float, rays: int) -> None:
-        import drjit as dr
-
         types = jit()
         # the four numbers of a ray side by side, so that one fetch brings them
         self._rays: Float = dr.ravel(types.Array4f(x, y, time, side))
@@ -78,8 +75,6 @@ class _Projected:
 
     def ends(self, directions: Sequence[tuple[Float, Float, Float]]) -> list[tuple[Float, Float]]:
         """Largest projection of the lower side and smallest of the higher one, in each direction."""
-        import drjit as dr
-
         types = jit()
 
         def step(k: UInt32, *ends: Float) -> tuple[UInt32, *tuple[Float, ...]]:
@@ -117,8 +112,6 @@ def widest_moving_gap(
     normal_x, normal_y, offset, speed : the line, see `PairEdges`.
     gap : at one time, px; negative where no such line separates the sides.
     """
-    import drjit as dr
-
     types = jit()
     projected = _Projected(x, y, time, side, rays)
     steps = table(types.Float, np.tan(np.deg2rad(np.array(_STEPS_DEG, np.float32))))

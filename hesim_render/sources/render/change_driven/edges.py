@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, UInt32
 from hesim_render.core.tables import spread_out
 from hesim_render.sources.render.change_driven.edge_search import widest_gap, widest_moving_gap
@@ -153,8 +154,6 @@ class EdgeFit:
         rays : number of rays of each pair, a power of two.
         moves : True where lines may move within the window.
         """
-        import drjit as dr
-
         types, (x, y, time, flux) = jit(), decision_rays
         ray = dr.arange(types.UInt32, len(flux))
         of, count = ray // dr.opaque(types.UInt32, rays), dr.opaque(types.Float, rays)
@@ -198,8 +197,6 @@ def joined_rays(first: Sequence[Float], pairs: NDArray[np.int64], more: Sequence
     more : of these pairs, as many each.
     rays : a power of two.
     """
-    import drjit as dr
-
     types = jit()
     half = dr.arange(types.UInt32, 2 * rays * pairs.size) // dr.opaque(types.UInt32, rays)
     within = dr.arange(types.UInt32, 2 * rays * pairs.size) - half * dr.opaque(types.UInt32, rays)
@@ -259,8 +256,6 @@ class LaneEdges:
         point : [0, 1)², place inside the strip, across and along it.
         share : [0, 1), share of the window at which a ray starts.
         """
-        import drjit as dr
-
         # a strip that moves is drawn at times at which its line meets the pixel
         moves = abs(self.speed) > LEAST_SPEED
         begin, span = self._times(moves)
@@ -287,8 +282,6 @@ class LaneEdges:
 
     def _times(self, moves: Mask) -> tuple[Float, Float]:
         """Begin and length of the time in which a moving line meets the pixel, shares of the window."""
-        import drjit as dr
-
         reach = 0.5 * (abs(self.normal_x) + abs(self.normal_y))
         per_px = dr.rcp(dr.select(moves, self.speed, 1))
         one, other = (-reach - self.offset) * per_px + 0.5, (reach - self.offset) * per_px + 0.5
@@ -299,8 +292,6 @@ class LaneEdges:
         """Begin and length of the part inside of the pixel of a line, which has a distance from the pixel's centre
         along the normal, px; the length is 0 or less if there is none.
         """
-        import drjit as dr
-
         # along the line, x is n_x·away − n_y·s and y is n_y·away + n_x·s
         low, high = type(away)(-10), type(away)(10)
         for middle, slope in ((self.normal_x * away, -self.normal_y), (self.normal_y * away, self.normal_x)):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.tables import table
 from hesim_render.spectral.waveform import Waveform
@@ -89,8 +90,6 @@ class LightTimes:
     @classmethod
     def of(cls, waveform: Waveform, begin_us: NDArray[np.float64], end_us: NDArray[np.float64]) -> LightTimes:
         """Put windows [w], µs, on the device."""
-        import drjit as dr
-
         parts, types = LightParts.of(waveform, begin_us, end_us), jit()
         rows = np.stack([parts.energy_before, parts.energy, parts.begin_us, parts.length_us], axis=1)
         # padded, because a table of one entry becomes a constant in the kernel
@@ -110,8 +109,6 @@ class LightTimes:
         window : number of the window.
         share : [0, 1).
         """
-        import drjit as dr
-
         types: Any = jit()
         low, high = (dr.gather(types.UInt32, numbers, window) for numbers in (self.first, self.last))
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Ray, UInt32, UInt64
 from hesim_render.core.method_cache import method_cache
 from hesim_render.core.rng import Stream, stream_key
@@ -80,8 +81,6 @@ class _Traced:
 
 def pair_of_rays(packets: NDArray[np.int64]) -> UInt32:
     """Pair of each ray, where pairs [n] have some packets of rays each, one pair after the other."""
-    import drjit as dr
-
     types = jit()
     packet = dr.arange(types.UInt32, int(packets.sum()) * PACKET) // PACKET
     return spread_out(types.UInt32, np.repeat(np.arange(packets.size, dtype=np.uint32), packets), packet)
@@ -117,8 +116,6 @@ class PacketTracer(Tracer):
         block_rays: int | None = None,
         light: Waveform | None = None,
     ) -> None:
-        import drjit as dr
-
         super().__init__(scene, sensor, responses, progress, block_rays)
         types, self._seed, self._light = jit(), seed, light
         self.rays.require_one_path()
@@ -150,8 +147,6 @@ class PacketTracer(Tracer):
         return something and bool(np.any(windows.end_us - windows.begin_us > _SHORT_US))
 
     def _key(self, stream: Stream) -> UInt64:
-        import drjit as dr
-
         mitsuba()  # the variant may have been changed by other code
         return dr.opaque(jit().UInt64, stream_key(self._seed, stream))
 
@@ -198,8 +193,6 @@ class PacketTracer(Tracer):
         -------
         Of each ray.
         """
-        import drjit as dr
-
         types = jit()
         used = int(packets.sum())
         ray_index = dr.arange(types.UInt32, used * PACKET)
@@ -251,8 +244,6 @@ class PacketTracer(Tracer):
         self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float, aims: LaneAims | LaneEdges | None
     ) -> _Rays:
         """One ray per lane."""
-        import drjit as dr
-
         mi, types = self.built.mi, jit()
         row, col = self._row_and_col(pixel)
         sampler = self._sampler

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.journal import Journal, key_of
 from hesim_render.sources.render.change_driven.aim import PairAims
@@ -55,8 +56,6 @@ class PairFlux:
         flux, met : of each ray, one pair after the other; `met` is 1 where the ray came near a moving object.
         packets, packet_rays : number of packets of each pair, and of rays in a packet.
         """
-        import drjit as dr
-
         # sums over half packets: a half of a pair is never smaller
         sums = np.array(dr.block_sum(flux, packet_rays // 2))
         bits = np.array(dr.block_reduce(dr.ReduceOp.Or, met, packet_rays))
@@ -122,8 +121,6 @@ class PilotFlux:
         before : the same rays in other windows, and [n] the pair among them to compare each pair with; None where there
             is none.
         """
-        import drjit as dr
-
         types, rays = jit(), RayStatistics(len(met) // samples, samples, alike)
         dr.eval(controlled, plain, unshadowed, met)
         results: dict[str, Float | UInt32] = {"unshadowed": rays.mean(unshadowed), "met": rays.any_bits(met)}
@@ -168,8 +165,6 @@ class PilotRays:
 
 def joined(first: PilotRays, second: PilotRays) -> PilotRays:
     """Rays of two lists of pairs, one after the other."""
-    import drjit as dr
-
     controlled, plain = (
         dr.concat([getattr(each, name) for each in (first, second)]) for name in ("controlled", "plain")
     )

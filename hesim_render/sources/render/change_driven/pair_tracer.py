@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt64
 from hesim_render.core.rng import Stream
 from hesim_render.core.tables import spread_out, table
@@ -121,8 +122,6 @@ class PairTracer(PacketTracer):
         -------
         Statistics of the pairs, [n].
         """
-        import drjit as dr
-
         count, out = pixel.size, PilotFlux.empty(pixel.size)
         moments, key = self._moments(windows, span_us), self._key(stream)
         footprint = dr.opaque(jit().Float, footprint_px)
@@ -190,8 +189,6 @@ class PairTracer(PacketTracer):
         -------
         Fits of the pairs, [n].
         """
-        import drjit as dr
-
         out, moments, key = EdgeFit.empty(pixel.size), self._moments(windows, None), self._key(stream)
         footprint, room = dr.opaque(jit().Float, footprint_px), max(1, self._block_rays // samples)
         for first in range(0, pixel.size, room):
@@ -230,7 +227,6 @@ class PairTracer(PacketTracer):
         """Lines of some pairs: of rays all over the pixel, as many more where these show contrast, and twice as many
         about a line, where there is one.
         """
-        import drjit as dr
 
         def decision_rays(
             some: NDArray[np.int64], rays: int, repeat: int, about: PairEdges | None = None
@@ -275,8 +271,6 @@ class PairTracer(PacketTracer):
         part: slice | NDArray[np.int64],
     ) -> None:
         """Flux of some pairs, each with some packets of rays."""
-        import drjit as dr
-
         types = jit()
         rays = packets * PACKET
         footprint = dr.opaque(types.Float, 1.0)

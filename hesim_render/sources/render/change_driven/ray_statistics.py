@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 
 #: (number of the ray in its pair, sums so far) → the sums with this ray.
@@ -18,8 +19,6 @@ Step = Callable[..., Sequence[Any]]
 
 def power_below(values: Float) -> Float:
     """The powers of two not above positive values; dividing by them rounds nothing. Of 0 it is the least normal one."""
-    import drjit as dr
-
     types = jit()
     exponent = dr.reinterpret_array(types.UInt32, values) & types.UInt32(0x7F800000)
     power: Float = dr.reinterpret_array(types.Float, exponent)
@@ -36,8 +35,6 @@ class RayStatistics:
     """
 
     def __init__(self, count: int, samples: int, alike: int) -> None:
-        import drjit as dr
-
         assert alike in (samples, samples // 2)
         types = jit()
         # numbers are no part of the kernel, so that it serves any number of rays
@@ -54,8 +51,6 @@ class RayStatistics:
 
     def any_bits(self, bits: UInt32) -> UInt32:
         """Bits that any ray of a pair has, [n]."""
-        import drjit as dr
-
         types = jit()
         either: UInt32
         (either,) = self._over_rays(
@@ -68,7 +63,6 @@ class RayStatistics:
 
         Deviations are those from the mean of each kind: what differs between kinds is no scatter.
         """
-        import drjit as dr
 
         def add(ray: UInt32, early: Float, late: Float) -> tuple[Float, Float]:
             value, is_early = self._at(values, ray), ray < self._alike
@@ -92,7 +86,6 @@ class RayStatistics:
         values : as for `mean`.
         before, first_before : the rays to compare with, and place of the first one of each pair among them.
         """
-        import drjit as dr
 
         def difference(ray: UInt32) -> Float:
             return self._at(values, ray) - dr.gather(jit().Float, before, first_before + ray)
@@ -107,8 +100,6 @@ class RayStatistics:
 
         It is about the largest deviation of the pair, as fourth powers of fluxes leave the range of float32.
         """
-        import drjit as dr
-
         (largest,) = self._over_rays(lambda ray, most: (dr.maximum(most, dr.abs(deviation(ray))),), 1)
         unit = power_below(largest)
         per_unit = 1 / unit
@@ -121,15 +112,11 @@ class RayStatistics:
         return unit, second, fourth
 
     def _at(self, values: Float, ray: UInt32) -> Float:
-        import drjit as dr
-
         each: Float = dr.gather(jit().Float, values, self._first + ray)
         return each
 
     def _over_rays(self, step: Step, states: int, kind: Any = None) -> Sequence[Any]:
         """Sums over the rays of each pair, from 0."""
-        import drjit as dr
-
         types, count = jit(), len(self._first)
         zeros = [dr.zeros(kind or types.Float, count) for _ in range(states)]
         _, *sums = dr.while_loop(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 
@@ -17,8 +18,6 @@ def least_depth_m(tracer: PairTracer, t_us: float) -> float:
 
     Depth is measured along the camera's axis. It is infinite where nothing is seen.
     """
-    import drjit as dr
-
     mitsuba()  # the variant may have been changed by other code
     mi, types, geometry, view = tracer.built.mi, jit(), tracer.sensor.spec.geometry, tracer.view
     left, right, top, bottom = view.followed_mm

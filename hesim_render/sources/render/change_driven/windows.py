@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.tables import table
 from hesim_render.sources.render.change_driven.light_times import LightTimes
@@ -66,8 +67,6 @@ class Moments:
 
     def at(self, window: UInt32, share: Float) -> Moment:
         """Instants in the window of each lane, before which a share of its light arrives."""
-        import drjit as dr
-
         if self.light is None:
             instant = share * dr.gather(type(self.length_us), self.length_us, window)
         else:
@@ -98,8 +97,6 @@ class Moments:
         -------
         The windows, evaluated on the device.
         """
-        import drjit as dr
-
         types = jit()
         # repeated tracks are wrapped on the host in float64: float32 loses fractions of a µs within seconds
         times = [
