@@ -10,7 +10,7 @@ import hesim_render as hr
 
 FAST, SLOW = range(1000, 1020), range(2000, 2500)
 #: Those of the first whose runs, or whose fluxes, take two or three seconds of a core, with audit and reference.
-QUICK_RUNS, QUICK_FLUXES = (1002, 1005, 1006, 1010, 1017), (1003, 1008, 1016, 1018, 1019)
+QUICK_RUNS, QUICK_FLUXES = (1002, 1006, 1017), (1003, 1016, 1019)
 
 
 def off_share_is_at_most(off, share):
