@@ -68,8 +68,7 @@ def about_edges(
     of = pixel[some], window[some], windows, tuning.edge_rays, tuning.edge_footprint_px, controlled[some], little
     moves = tracer.moves_within(windows)
     fit.replace(new, tracer.edges(*of, stream, moves))
-    # of rays that all see the same, none is above the middle
-    contrast = np.maximum(fit.high - fit.low, 0) / wanted
+    contrast = (fit.high - fit.low) / wanted
     is_edge = fit.is_edge & (contrast >= 1)
     # both sides belong to the scatter of a pair that has no edge
     by_scatter = gain.rays(np.where(is_edge, 0, 0.5 * contrast) + fit.scatter / wanted)

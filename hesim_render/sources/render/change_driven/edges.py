@@ -166,8 +166,10 @@ class EdgeFit:
         above = flux > spread(middle)
         above_count = dr.block_sum(dr.select(above, types.Float(1), 0), rays)
         below_count = count - above_count
-        high = dr.block_sum(dr.select(above, flux, 0), rays) / dr.maximum(above_count, 1)
         low = dr.block_sum(dr.select(above, 0, flux), rays) / dr.maximum(below_count, 1)
+        # of rays that all see the same, none is above the middle: both levels are the same
+        high = dr.block_sum(dr.select(above, flux, 0), rays) / dr.maximum(above_count, 1)
+        high = dr.select(above_count > 0, high, low)
         deviation = flux - dr.select(above, spread(high), spread(low))
         # relative to the largest flux, so that no square leaves float32
         unit = dr.maximum(dr.block_reduce(dr.ReduceOp.Max, dr.abs(flux), rays), 1e-30)

@@ -68,16 +68,14 @@ def held_pairs(
     asked : [window, pixel], those for which only neighbours ask; no other pair is held.
     """
     count, pixels = asked.shape
-    # where all rays see the same, none is above the middle, and the higher level is 0
-    high, gap = np.maximum(fit.high, fit.low), np.float32(0.5) * fit.gap
-    contrast = high - fit.low
+    contrast, gap = fit.high - fit.low, np.float32(0.5) * fit.gap
     # least and largest flux that the decision rays allow, [k]: an edge lies anywhere in its gap, and its sides scatter
     least, most = (
         fit.low + contrast * halfplane_share(fit.normal_x, fit.normal_y, fit.offset + sign * gap) + sign * fit.scatter
         for sign in (-1, 1)
     )
     # without a line, anything between both levels
-    least, most = np.where(fit.is_edge, least, fit.low), np.where(fit.is_edge, most, high)
+    least, most = np.where(fit.is_edge, least, fit.low), np.where(fit.is_edge, most, fit.high)
     # levels of an edge say nothing by themselves
     uneven = np.where(fit.is_edge, np.inf, contrast)
     now = np.stack([least, most, uneven]).astype(np.float32)
