@@ -3,7 +3,8 @@
 The integral of a product is exact (`integrate_product`); where a product has to be a spectrum itself, it
 is sampled on the merged grid of all factors, refined to 1 nm or finer (0.02 % off; the unrefined merged
 grid is 0.25-0.4 % off, sums of 10 nm rectangles up to 8 %). Named data come from colour-science; see
-`illuminant`, `colorchecker_reflectances` and `camera_sensitivity`.
+`illuminant`, `colorchecker_reflectances` and `camera_sensitivity`. Those of most scenes and sensors are copied to
+``named.npz``, because the import of colour-science takes most of a second.
 """
 
 from __future__ import annotations
@@ -19,12 +20,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import SpecError, did_you_mean
 from hesim_render.core.guard import WholeFile
+from hesim_render.core.npz import read_arrays
 from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
 
 #: Largest step of the grid on which products are integrated, nm.
 INTEGRATION_STEP_NM = 1.0
 #: Share of a response that light and reflectance must cover; a smaller coverage would lose signal silently.
 REQUIRED_COVERAGE = 0.999
+#: Copies from colour-science by ``tests/spectral/test_named.py``: rows of wavelengths, nm, and values, ``table/curve``.
+NAMED_FILE = Path(__file__).with_name("named.npz")
 #: Wavelengths the spectral renderer can carry, nm (Mitsuba 3's CIE range).
 RENDERABLE_NM = (360.0, 830.0)
 
@@ -175,6 +179,16 @@ def colour_science() -> Any:
     return colour
 
 
+@functools.cache
+def _copies() -> dict[str, dict[str, Spectrum]]:
+    """Curves by table and name, of `NAMED_FILE`."""
+    tables: dict[str, dict[str, Spectrum]] = {}
+    for name, rows in read_arrays(NAMED_FILE).items():
+        table, _, curve = name.partition("/")
+        tables.setdefault(table, {})[curve] = Spectrum(*rows)
+    return tables
+
+
 def _from_colour(distribution) -> Spectrum:  # noqa: ANN001 - colour.SpectralDistribution
     return Spectrum(np.asarray(distribution.wavelengths), np.asarray(distribution.values))
 
@@ -195,6 +209,8 @@ def illuminant_names() -> list[str]:
 
 def illuminant(name: str) -> Spectrum:
     """Relative spectral power of a named illuminant (``D65``, ``A``, ``FL11``, ``LED-B3``, …)."""
+    if copy := _copies().get(f"illuminant {name}"):
+        return copy[name]
     colour = colour_science()
     if name in colour.SDS_LIGHT_SOURCES:
         return _from_colour(colour.SDS_LIGHT_SOURCES[name])
@@ -215,17 +231,21 @@ def colorchecker_reflectances(dataset: str = "ISO 17321-1") -> dict[str, Spectru
 @functools.cache
 def _patches(dataset: str) -> dict[str, Spectrum]:
     """The patches of a chart; a scene of many tiles asks for them as often."""
+    if copy := _copies().get(f"ColorChecker {dataset}"):
+        return copy
     charts = colour_science().SDS_COLOURCHECKERS
     return {name: _from_colour(sd) for name, sd in _lookup(charts, dataset, "ColorChecker data set").items()}
 
 
 def camera_sensitivity(camera: str, channel: str) -> Spectrum:
     """Peak-normalised camera sensitivity per unit *energy* of colour-science, per channel."""
-    curves = _lookup(colour_science().MSDS_CAMERA_SENSITIVITIES, camera, "camera")
-    labels = [str(label) for label in curves.labels]
-    if channel not in labels:
-        raise SpecError(f"camera {camera!r} has no channel {channel!r}; it has {', '.join(labels)}")
-    return Spectrum(np.asarray(curves.wavelengths), np.asarray(curves.values)[:, labels.index(channel)])
+    curves = _copies().get(f"camera {camera}")
+    if curves is None:
+        table = _lookup(colour_science().MSDS_CAMERA_SENSITIVITIES, camera, "camera")
+        curves = {str(one.name): _from_colour(one) for one in table.to_sds()}
+    if channel not in curves:
+        raise SpecError(f"camera {camera!r} has no channel {channel!r}; it has {', '.join(curves)}")
+    return curves[channel]
 
 
 def srgb_reflectances() -> tuple[Spectrum, Spectrum, Spectrum]:
@@ -233,21 +253,19 @@ def srgb_reflectances() -> tuple[Spectrum, Spectrum, Spectrum]:
 
     Each lies between 0 and 1, they sum to 1, and under D65 a mixture has the tristimulus values of its colour.
     """
-    table = colour_science().recovery.MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
-    red, green, blue = (Spectrum(np.asarray(table.wavelengths), column) for column in np.asarray(table.values).T)
+    red, green, blue = _copies()["sRGB"].values()
     return red, green, blue
 
 
-@functools.cache
 def photopic() -> Spectrum:
     """V(λ), CIE 1924 photopic luminous efficiency, 360-830 nm at 1 nm."""
-    return _from_colour(colour_science().SDS_LEFS["CIE 1924 Photopic Standard Observer"])
+    (curve,) = _copies()["V"].values()
+    return curve
 
 
 def colour_matching_functions() -> tuple[Spectrum, Spectrum, Spectrum]:
     """x̄, ȳ, z̄ of the CIE 1931 2° observer, 360-830 nm at 1 nm."""
-    table = colour_science().MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    x, y, z = (Spectrum(np.asarray(table.wavelengths), column) for column in np.asarray(table.values).T)
+    x, y, z = _copies()["CIE 1931"].values()
     return x, y, z
 
 

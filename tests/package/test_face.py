@@ -48,14 +48,15 @@ def test_descriptions_are_short_and_say_what_is_what():
 @pytest.mark.parametrize(
     "call",
     [
-        "hr.load_sensor('reference-bayer')",
+        "illuminant('FL11')",
         pytest.param("colour.delta_e_2000([[1, 1, 1]], [[1, 1, 0]])", marks=pytest.mark.slow),
     ],
 )
 def test_numpy_prints_as_before(call):
     """colour-science sets NumPy's print options for the whole process when it is imported."""
     code = (
-        "import numpy as np, hesim_render as hr\nfrom hesim_render.isp import colour\n"
+        "import numpy as np, hesim_render\nfrom hesim_render.isp import colour\n"
+        "from hesim_render.spectral.spectrum import illuminant\n"
         f"before = np.get_printoptions()\n{call}\nprint(np.get_printoptions() == before)\n"
         "import sys; print('colour' in sys.modules)"
     )
