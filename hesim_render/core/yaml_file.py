@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import pickle
 from pathlib import Path
 from typing import IO, Any
 
@@ -15,6 +17,8 @@ from hesim_render.core.guard import WholeFile, reading
 
 #: Largest file; as Python objects with line numbers it takes about a hundred times as much memory.
 _MOST_BYTES = 16 << 20
+#: Length of a text from which its content is not kept for the next reader.
+_MOST_KEPT = 1 << 16
 #: Largest number of values after all aliases are expanded; a calibration of a 16 x 16 tile has a few thousand.
 _MOST_VALUES = 1_000_000
 
@@ -41,7 +45,8 @@ def parse_yaml(text: str, file: Path, with_lines: bool = True) -> Any:
         try:
             if "*" in text:
                 _check_aliases(text, file)
-            data = YAML(typ="rt" if with_lines else "safe").load(text)
+            kind = "rt" if with_lines else "safe"
+            data = pickle.loads(_parsed(text, kind)) if len(text) < _MOST_KEPT else YAML(typ=kind).load(text)
         except MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             raise SpecError(
@@ -52,6 +57,12 @@ def parse_yaml(text: str, file: Path, with_lines: bool = True) -> Any:
     if not isinstance(data, CommentedMap if with_lines else dict):
         raise SpecError("expected a mapping of keys to values at the top level", file=file, line=1)
     return data
+
+
+@functools.lru_cache(64)
+def _parsed(text: str, kind: str) -> bytes:
+    """The content of a text, pickled: a parse takes as long as fifty copies, and studies read the same files often."""
+    return pickle.dumps(YAML(typ=kind).load(text))
 
 
 def write_yaml(content: object, stream: IO[str], width: int = 110, is_sorted: bool = False) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from hesim_render.core import yaml_file
 from hesim_render.core.errors import HesimWarning, RangeError, SpecError
 from hesim_render.core.yaml_file import read_yaml
 from hesim_render.mosaic.layout import Layout
@@ -477,3 +478,21 @@ def test_items_of_lists_are_set_by_their_numbers(tmp_path):
     for key, most in (("a.2", 1), ("a.0.c.x", 2), ("a.0.c.3", 2)):
         with pytest.raises(SpecError, match=f"the list here has items 0 to {most}"):
             apply_overrides(data, {key: 1})
+
+
+def test_a_file_is_parsed_once_and_its_readers_share_nothing(tmp_path, monkeypatch):
+    text = "name: a\nevs: {tick_us: 3}\nlist: [1.5, 2]\n"
+    (tmp_path / "a.yaml").write_text(text)
+    (tmp_path / "long.yaml").write_text(text + "#" * (1 << 16))  # what is long is not kept
+    for with_lines in (True, False):
+        first = read_yaml(tmp_path / "a.yaml", with_lines)
+        first["evs"]["tick_us"] = 99
+        first["list"].append(7)
+        read_yaml(tmp_path / "long.yaml", with_lines)
+        with monkeypatch.context() as patch:
+            patch.setattr(yaml_file, "YAML", lambda typ: pytest.fail("parsed again"))
+            again = read_yaml(tmp_path / "a.yaml", with_lines)
+            assert again == {"name": "a", "evs": {"tick_us": 3}, "list": [1.5, 2]}
+            assert hasattr(again, "lc") == with_lines and (not with_lines or again["list"].lc.line == 2)
+            with pytest.raises(pytest.fail.Exception):
+                read_yaml(tmp_path / "long.yaml", with_lines)
