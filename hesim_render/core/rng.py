@@ -112,7 +112,9 @@ def random_words(seed: int, stream: Stream, pixel: np.ndarray, index: np.ndarray
     types = jit()
     key = dr.opaque(types.UInt64, stream_key(seed, stream))
     counters = (types.UInt32(np.ascontiguousarray(values, np.uint32)) for values in (pixel, index, draw))
-    return np.array(types.Philox4x32(key, *counters).next_uint32x4(), dtype=np.uint32)
+    words = types.Philox4x32(key, *counters).next_uint32x4()
+    dr.eval(words)  # by one kernel for any n; one array of all words would need another kernel for each n
+    return np.stack([word.numpy() for word in words])
 
 
 def uniform(word: np.ndarray) -> np.ndarray:
