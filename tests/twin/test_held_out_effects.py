@@ -15,6 +15,12 @@ CAMERA = emva_camera.Camera(
 )  # fmt: skip
 
 
+@pytest.fixture
+def no_page(monkeypatch):
+    """Without pages, whose drawings take most of the time of a twin."""
+    monkeypatch.setattr(run, "page", lambda checks, texts: "")
+
+
 def doubled_columns(frames, rng):
     """Column noise of twice its rms."""
     return frames + np.sqrt(3) * CAMERA.column_noise * rng.standard_normal((len(frames), 1, CAMERA.cols))
@@ -111,6 +117,7 @@ def twin_of_sensor(folder, name, seed, lacking=()):
     return make_twin(captures / maker.name, folder / f"twin-{seed}", seed=1000 + seed)
 
 
+@pytest.mark.usefixtures("no_page")
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == "CMOS" else pytest.mark.slow) for n in SENSORS])
 def test_twins_of_unlike_sensors_pass(tmp_path, name):
     """Three pairs are lacking. A drift of the light is named."""
@@ -148,6 +155,7 @@ def test_where_rounding_hides_the_dark_noise_grey_values_tell_it(tmp_path, monke
     assert any("by the probabilities of grey values it is 0.2" in finding.text for finding in twin.findings)
 
 
+@pytest.mark.usefixtures("no_page")
 @pytest.mark.parametrize("factor", (0.93, 1.0, 1.07))
 def test_where_a_full_well_ends_is_compared(tmp_path, monkeypatch, factor):
     """Levels beyond saturation tell it, also where the twin's is too large to be seen at any level below."""
@@ -165,6 +173,7 @@ def test_where_a_full_well_ends_is_compared(tmp_path, monkeypatch, factor):
     assert failed <= {"end of the signal, lit"} or factor < 1.0
 
 
+@pytest.mark.usefixtures("no_page")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS)
 def test_right_twins_fail_as_rarely_as_stated(tmp_path, name):
@@ -173,6 +182,7 @@ def test_right_twins_fail_as_rarely_as_stated(tmp_path, name):
     assert len(failed) <= 1
 
 
+@pytest.mark.usefixtures("no_page")
 @pytest.mark.slow
 def test_twins_of_twenty_cameras_pass(tmp_path):
     """Of 20 statistics each fails in one of 1000 right twins, so that two of 20 twins fail with a chance of 6 %."""
@@ -187,6 +197,7 @@ EFFECTS = {
 }
 
 
+@pytest.mark.usefixtures("no_page")
 @pytest.mark.parametrize("name", EFFECTS)
 def test_an_effect_that_the_fitted_half_lacks_fails_where_it_is(tmp_path, name):
     effect, expected = EFFECTS[name]
@@ -208,6 +219,7 @@ SMALLER = {
 }
 
 
+@pytest.mark.usefixtures("no_page")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SMALLER)
 def test_smaller_effects_are_told_by_most_twins(tmp_path, name):

@@ -85,6 +85,7 @@ def test_a_wrong_twin_fails_where_it_is_wrong(captures, tmp_path, monkeypatch, n
     from hesim_render.sensor.sensor import load_sensor
     from hesim_render.twin import run
 
+    monkeypatch.setattr(run, "page", lambda checks, texts: "")  # its drawings take most of the time
     changes, expected = WRONG[name]
     monkeypatch.setattr(run, "load_sensor", lambda file: load_sensor(file, changes))
     twin = make_twin(captures, tmp_path / "out", seed=3)
