@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.recording.colour_view import Picture
@@ -81,8 +81,12 @@ def fitted(picture: Picture, width_px: int) -> Picture:
 
 def magnified(picture: Picture) -> Picture:
     """A small picture at about the width of a panel, by a whole number; a larger one as it is."""
-    scale = max(1, round(_PANEL_PX / picture.shape[1]))
+    scale = _magnification(picture.shape[1])
     return picture.repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def _magnification(cols: int) -> int:
+    return max(1, round(_PANEL_PX / cols))
 
 
 def busiest_window(picture: Picture, fraction: float) -> tuple[float, float]:
@@ -123,6 +127,9 @@ def panel_sheet(panels: Sequence[Panel], title: str, width_px: int) -> Image.Ima
 
 
 def save_animation(path: str, pictures: Sequence[Picture]) -> None:
-    """An endless animated GIF."""
+    """An endless animated GIF of pictures, each `magnified`: after its colours are chosen, which then takes a twentieth
+    of the time.
+    """
     images = [Image.fromarray(picture).quantize(96) for picture in pictures]
+    images = [ImageOps.scale(image, _magnification(image.width), Image.Resampling.NEAREST) for image in images]
     images[0].save(path, format="GIF", save_all=True, append_images=images[1:], duration=80, loop=0, optimize=False)

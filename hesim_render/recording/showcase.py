@@ -56,7 +56,7 @@ def write_previews(recording: Recorded, folder: Path) -> list[Path]:
     if len(pictures) > 1:
         written.append(folder / "preview.gif")
         with replacing(written[-1]) as temporary:
-            preview.save_animation(str(temporary), [preview.magnified(picture) for picture in pictures])
+            preview.save_animation(str(temporary), pictures)
     return written
 
 

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shutil
 import time
 import zipfile
 from pathlib import Path
@@ -26,10 +27,16 @@ from hesim_render.recording.recording import Recording
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole") / "r"
+    recordings.make("eiger", folder, width=32, height=32, duration_us=60_000)
+    return folder
+
+
 @pytest.fixture
-def folder(tmp_path):
-    recordings.make("eiger", tmp_path / "r", width=32, height=32, duration_us=60_000)
-    return tmp_path / "r"
+def folder(whole, tmp_path):
+    return shutil.copytree(whole, tmp_path / "r")
 
 
 def change_manifest(folder, change):

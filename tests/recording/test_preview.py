@@ -185,6 +185,10 @@ def test_moving_scene_gets_an_animation(tmp_path):
     recording.save(tmp_path / "r")
     with Image.open(tmp_path / "r" / "preview.gif") as picture:
         assert picture.n_frames >= 20 and picture.size == (640, 480)  # five times the frames
+        first = np.asarray(picture.convert("RGB")).astype(int)
+    small = showcase.animation(Recording.load(tmp_path / "r"))[0]  # 96 colours of it
+    assert np.abs(first - small.repeat(5, axis=0).repeat(5, axis=1)).mean() < 2
+    np.testing.assert_array_equal(first, first[::5, ::5].repeat(5, axis=0).repeat(5, axis=1))
     assert showcase.moves(Recording.load(tmp_path / "r"))
 
 
