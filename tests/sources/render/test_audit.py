@@ -16,7 +16,7 @@ from hesim_render.sources.render.audit import audit as audit_module
 from hesim_render.sources.render.audit.audit import STRETCHES, Audit
 from hesim_render.sources.render.audit.compare import Tally, compare_crossings, compare_ticks
 from hesim_render.sources.render.audit.confidence import lower_bound, ratio_upper_bound, upper_bound
-from hesim_render.sources.render.audit.units import NotedFlux, Units
+from hesim_render.sources.render.audit.units import NotedFlux, Units, in_random_order
 
 ROWS, COLS, TICKS, TICK_US = 24, 32, 120, 1000
 QUALITY, UNIT = 0.5, 0.03
@@ -144,6 +144,33 @@ def test_estimates_are_the_shares_themselves(monkeypatch):
     assert found["off"] == pytest.approx(off, rel=0.3) and found["missed"] == pytest.approx(missed, rel=0.3)
     assert found["extra"] == pytest.approx(extra, rel=0.3)
     assert found["deviation_noise"]["largest"] >= (1 - 1 / 1.6) / UNIT * 0.999
+
+
+def test_batches_hold_each_unit_once_in_the_order_that_was_drawn():
+    cores = [(False, True, False), (True, False), (False, True, False), (True, False), (True,)]
+    noted, known = [], []
+    for number, (core, size) in enumerate(zip(cores, (40, 7, 0, 23, 61), strict=True)):
+        name = 100.0 * number + np.arange(size)
+        known += [(value, core) for value in name]
+        rows = [1000.0 * name + 10 * field + np.arange(len(core))[:, None] for field in range(5)]
+        noted.append(Units(name.astype(np.uint32), *rows[:2], np.array(core), *rows[2:]))
+    order = np.random.default_rng(5).permutation(len(known))
+    batches = list(in_random_order(noted, np.random.default_rng(5), 9, 36))
+    assert [sum(place.size for place, _ in batch) for batch in batches] == [9, 18, 36, 36, 32]
+    first = 0
+    for batch in batches:
+        places = np.concatenate([place for place, _ in batch])
+        assert sorted(places) == list(range(first, first + places.size))
+        first += places.size
+        assert len({units.core.tobytes() for _, units in batch}) == len(batch)  # one part for each shape
+        for place, units in batch:
+            assert list(units.pixel) == [known[k][0] for k in order[place]]
+            assert {known[k][1] for k in order[place]} == {tuple(units.core)}
+            for field, name in enumerate(("begin_us", "end_us", "flux", "difference", "error")):
+                rows = 1000.0 * units.pixel + 10 * field + np.arange(units.core.size)[:, None]
+                np.testing.assert_array_equal(getattr(units, name), rows)
+            # list by list, as the choices that are made for each unit depend on the order
+            assert np.all(np.diff(units.pixel.astype(int) // 100) >= 0)
 
 
 def test_events_of_a_run_that_has_none_in_truth_are_too_many():

@@ -9,6 +9,7 @@ the whole run, at whatever number of units the audit stops (`confidence`).
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.sources.protocol import AuditableFlux
 from hesim_render.sources.render.audit.compare import Counted, Tally, compare_crossings, compare_ticks
 from hesim_render.sources.render.audit.confidence import lower_bound, ratio_upper_bound, upper_bound
-from hesim_render.sources.render.audit.units import NotedFlux, Units
+from hesim_render.sources.render.audit.units import Batch, NotedFlux, Units, in_random_order
 from hesim_render.sources.render.change_driven.tuning import FINEST_QUALITY
 
 #: Confidence of each stated bound.
@@ -91,11 +92,15 @@ class Audit:
         they are few, they estimate the number of events, and only they can have an extra event. In a shorter first
         part, the other units are examined as well, because any of them may have a value that is off or a missed event.
         """
-        begin, batches = self._source.rays_traced, self._batches(noted)
-        tally, result, seen = Tally(sum(units.pixel.size for units in noted)), dict[str, Any](), 0
+        begin, batches, seen = (
+            self._source.rays_traced,
+            in_random_order(noted, self._rng, _LEAST_BATCH, _MOST_BATCH),
+            list[Batch](),
+        )
+        tally, result = Tally(sum(units.pixel.size for units in noted)), dict[str, Any]()
         if events:
             for batch in batches:
-                seen += 1
+                seen.append(batch)
                 self._look_at(batch, tally, "eventful")
                 spent = self._source.rays_traced - begin
                 if spent > room / 2 or (
@@ -103,8 +108,8 @@ class Audit:
                 ):
                     break
         start = self._source.rays_traced
-        for number, batch in enumerate(batches):
-            if events and number >= seen:
+        for number, batch in enumerate(chain(seen, batches)):
+            if events and number >= len(seen):
                 self._look_at(batch, tally, "eventful")
             self._look_at(batch, tally, "calm" if events else "frames")
             result = self._bounds(tally, events)
@@ -114,26 +119,7 @@ class Audit:
                 break
         return result
 
-    def _batches(self, noted: list[Units]) -> list[list[tuple[NDArray[np.int64], Units]]]:
-        """All units in random order, in batches of growing size, grouped by shape, with their places in that order."""
-        which = np.concatenate([np.full(units.pixel.size, number) for number, units in enumerate(noted)])
-        inside = np.concatenate([np.arange(units.pixel.size) for units in noted])
-        order, batches, first, size = self._rng.permutation(which.size), [], 0, _LEAST_BATCH
-        while first < order.size:
-            chosen = order[first : first + size]
-            by_shape: dict[bytes, list[tuple[NDArray[np.int64], Units]]] = {}
-            for one in np.unique(which[chosen]):
-                here = np.flatnonzero(which[chosen] == one)
-                units = noted[one].at(inside[chosen[here]])
-                by_shape.setdefault(units.core.tobytes(), []).append((first + here, units))
-            batches.append(
-                [(np.concatenate([place for place, _ in parts]), Units.joined([units for _, units in parts]))
-                 for parts in by_shape.values()]
-            )  # fmt: skip
-            first, size = first + chosen.size, min(2 * size, _MOST_BATCH)
-        return batches
-
-    def _look_at(self, batch: list[tuple[NDArray[np.int64], Units]], tally: Tally, which: str) -> None:
+    def _look_at(self, batch: Batch, tally: Tally, which: str) -> None:
         """Render the reference of some units of a batch and count the results.
 
         Parameters

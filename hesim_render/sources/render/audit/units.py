@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,6 +53,36 @@ class Units:
         """Join units of the same shape."""
         values = {name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in _BY_WINDOW}
         return cls(pixel=np.concatenate([part.pixel for part in parts]), core=parts[0].core, **values)
+
+
+#: Units grouped by shape, with their places in a random order.
+Batch: TypeAlias = list[tuple[NDArray[np.int64], Units]]
+
+
+def in_random_order(noted: Sequence[Units], rng: np.random.Generator, least: int, most: int) -> Iterator[Batch]:
+    """All units in random order, in batches of `least` to `most` units, each twice as large as the one before it.
+
+    A batch is made when it is asked for, because an audit stops long before the last one.
+    """
+    size_of = np.array([units.pixel.size for units in noted])
+    which = np.repeat(np.arange(len(noted)), size_of)
+    order, first, size = rng.permutation(which.size), 0, least
+    # units of one shape stand in one place: number of the shape of each list, and where its first unit stands
+    shapes: dict[bytes, list[int]] = {}
+    for number, units in enumerate(noted):
+        shapes.setdefault(units.core.tobytes(), []).append(number)
+    shape, begin = np.zeros(len(noted), np.intp), np.zeros(len(noted), np.intp)
+    for number, members in enumerate(shapes.values()):
+        shape[members], begin[members] = number, np.cumsum(size_of[members]) - size_of[members]
+    joined = [Units.joined([noted[member] for member in members]) for members in shapes.values()]
+    stands = np.arange(which.size) - np.repeat(np.cumsum(size_of) - size_of - begin, size_of)
+    while first < order.size:
+        chosen = order[first : first + size]
+        here = np.argsort(which[chosen], kind="stable")  # list by list
+        kinds = shape[which[chosen[here]]]
+        parts = {number: here[kinds == number] for number in dict.fromkeys(kinds.tolist())}
+        yield [(first + place, joined[number].at(stands[chosen[place]])) for number, place in parts.items()]
+        first, size = first + chosen.size, min(2 * size, most)
 
 
 @dataclass
