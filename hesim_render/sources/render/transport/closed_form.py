@@ -118,16 +118,19 @@ def _parallelogram(
 def _at_corners(mi: MitsubaModule, shape: MitsubaObject) -> dict[str, NDArray[np.float64]]:
     """Mitsuba's surface data at the corners of a mesh's triangles, [faces, 2, 3 corners, ...] each."""
     count = shape.face_count()
-    hit = dr.zeros(mi.PreliminaryIntersection3f, 3 * count)
-    hit.valid, hit.t, hit.shape = mi.Bool(True), mi.Float(1.0), mi.ShapePtr(shape)
-    hit.prim_index = mi.UInt32(np.repeat(np.arange(count, dtype=np.uint32), 3))
-    hit.prim_uv = mi.Point2f(np.tile(np.array([[0, 0], [1, 0], [0, 1]], np.float32), (count, 1)).T)
+    hit, number = dr.zeros(mi.PreliminaryIntersection3f, 3 * count), dr.arange(mi.UInt32, 3 * count)
+    # a shape that is a constant of the kernel would need a kernel of its own
+    hit.valid, hit.t, hit.shape = mi.Bool(True), mi.Float(1.0), dr.opaque(mi.ShapePtr, shape)
+    hit.prim_index, corner = number // 3, number % 3
+    hit.prim_uv = mi.Point2f(dr.select(corner == 1, 1.0, 0.0), dr.select(corner == 2, 1.0, 0.0))
     ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(0, 0, 1))
     si = hit.compute_surface_interaction(ray, mi.RayFlags.All, mi.Bool(True))
-    # evaluated together: each would be a kernel of its own, compiled for this shape alone
     data = {"n": si.n, "shading": si.sh_frame.n, "s": si.sh_frame.s, "dp_du": si.dp_du, "dp_dv": si.dp_dv, "uv": si.uv}
-    dr.eval(data)
-    return {name: np.array(value, np.float64).T.reshape(count // 2, 2, 3, -1) for name, value in data.items()}
+    dr.eval(data)  # all by one kernel
+    return {
+        name: np.stack([axis.numpy() for axis in value], axis=-1).astype(np.float64).reshape(count // 2, 2, 3, -1)
+        for name, value in data.items()
+    }
 
 
 @dataclass(frozen=True)
