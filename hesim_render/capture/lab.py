@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hesim_render.capture.bench import Bench, set_up, truth_of
 from hesim_render.capture.lab_trials import TrialBench, TrialPlan, plan_trials
 from hesim_render.core.backend import jit
+from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError
 from hesim_render.core.npz import NpzWriter
@@ -189,7 +190,7 @@ class _Session:
 
         def shoot() -> Iterator[NDArray[np.uint16]]:
             for exposure_us in exposures_us:
-                electrons = flux * (exposure_us * S_PER_US)
+                electrons = flux * dr.opaque(jit().Float, exposure_us * S_PER_US)  # a constant is another kernel
                 for _ in range(frames):
                     raw = aps.sample(electrons, exposure_us, self.seed, self.frame)
                     self.frame += 1
