@@ -5,6 +5,7 @@ import json
 import zipfile
 from types import SimpleNamespace
 
+import drjit as dr
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -47,6 +48,18 @@ def session(tmp_path_factory):
 def few_trials(monkeypatch):
     """Three trials of each step of contrast in place of 50, where no statistics are made of them."""
     monkeypatch.setattr("hesim_render.capture.lab._LEAST_TRIALS", 3)
+
+
+def test_exposures_share_the_kernel_that_samples_them(tmp_path):
+    """Within it as a constant, each of the five dark and eight lit exposures would compile it again."""
+    sensor = hr.load_sensor(
+        "reference-mono", {"pixels.M.roles": ["aps"], "evs": None, "sources": {}, "assumptions": {}}
+    )
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        write_captures(sensor.crop(16, 8), tmp_path / "set", frames=8, seed=3)
+        kernels = {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
+    assert 1 <= len(kernels) < 8 < len(DARK_EXPOSURES_US) + len(LIT_EXPOSURES_US)
 
 
 def arrays(file):

@@ -149,14 +149,14 @@ def test_estimates_are_the_shares_themselves(monkeypatch):
 def test_batches_hold_each_unit_once_in_the_order_that_was_drawn():
     cores = [(False, True, False), (True, False), (False, True, False), (True, False), (True,)]
     noted, known = [], []
-    for number, (core, size) in enumerate(zip(cores, (40, 7, 0, 23, 61), strict=True)):
-        name = 100.0 * number + np.arange(size)
+    for number, (core, size) in enumerate(zip(cores, (400, 70, 0, 230, 610), strict=True)):
+        name = 1000.0 * number + np.arange(size)
         known += [(value, core) for value in name]
-        rows = [1000.0 * name + 10 * field + np.arange(len(core))[:, None] for field in range(5)]
+        rows = [10_000.0 * name + 10 * field + np.arange(len(core))[:, None] for field in range(5)]
         noted.append(Units(name.astype(np.uint32), *rows[:2], np.array(core), *rows[2:]))
     order = np.random.default_rng(5).permutation(len(known))
-    batches = list(in_random_order(noted, np.random.default_rng(5), 9, 36))
-    assert [sum(place.size for place, _ in batch) for batch in batches] == [9, 18, 36, 36, 32]
+    batches = list(in_random_order(noted, np.random.default_rng(5), 90, 360))
+    assert [sum(place.size for place, _ in batch) for batch in batches] == [90, 180, 360, 360, 320]
     first = 0
     for batch in batches:
         places = np.concatenate([place for place, _ in batch])
@@ -167,10 +167,11 @@ def test_batches_hold_each_unit_once_in_the_order_that_was_drawn():
             assert list(units.pixel) == [known[k][0] for k in order[place]]
             assert {known[k][1] for k in order[place]} == {tuple(units.core)}
             for field, name in enumerate(("begin_us", "end_us", "flux", "difference", "error")):
-                rows = 1000.0 * units.pixel + 10 * field + np.arange(units.core.size)[:, None]
+                rows = 10_000.0 * units.pixel + 10 * field + np.arange(units.core.size)[:, None]
                 np.testing.assert_array_equal(getattr(units, name), rows)
             # list by list, as the choices that are made for each unit depend on the order
-            assert np.all(np.diff(units.pixel.astype(int) // 100) >= 0)
+            step = np.diff(units.pixel.astype(int) // 1000)
+            assert np.all(step >= 0) and np.all(np.diff(place)[step == 0] > 0)
 
 
 def test_events_of_a_run_that_has_none_in_truth_are_too_many():
@@ -280,6 +281,26 @@ def test_an_audit_gives_up_where_its_rays_would_not_do(monkeypatch):
     assert whole["events"]["missed_at_most"] > whole["events"]["missed_wanted_at_most"]
     # what is left over what was spent, from an eighth of all on
     assert 3 < times_left[0] < 8 and min(times_left) >= 1 and times_left == sorted(times_left, reverse=True)
+
+
+def test_each_batch_is_looked_at_once_for_its_events_and_in_the_same_order_for_the_rest(monkeypatch):
+    """Events are enough long before a share of values off that is near its limit."""
+    monkeypatch.setattr(audit_module, "_RAYS", 100_000)
+    monkeypatch.setattr(audit_module, "_is_hopeless", lambda shares, times: False)
+    rng = np.random.default_rng(3)
+    truth = np.full((TICKS, ROWS * COLS), 1e5)
+    truth[::2, : ROWS * COLS // 4] *= 1.5
+    run = np.where(rng.random(truth.shape) < 0.019, 1.06, 1.0) * truth
+    looked, look_at = {"eventful": [], "calm": []}, Audit._look_at
+
+    def noted(self, batch, tally, which):
+        looked[which].append(min(int(place.min()) for place, _ in batch))
+        look_at(self, batch, tally, which)
+
+    monkeypatch.setattr(Audit, "_look_at", noted)
+    audited(run, truth, 1)
+    eventful, calm = looked.values()
+    assert eventful == calm == sorted(set(calm))
 
 
 class HalfStill(Given):

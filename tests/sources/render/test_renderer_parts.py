@@ -1,5 +1,6 @@
 """Faces and balls that are met in closed form, against Mitsuba's own search and its own surfaces."""
 
+import drjit as dr
 import numpy as np
 import pytest
 from rendering import mitsuba_scene, mono, pair_tracer, traced
@@ -245,3 +246,15 @@ def test_an_even_sky_is_left_to_the_surfaces_own_directions():
     assert max(errors) < 1e-3 * means[1]
     assert abs(means[0] - means[1]) < 4.5 * np.hypot(*errors)
     assert weights_and_flux({"floor": floor, "sky": sky})[0] == {"ConstantBackgroundEmitter": 1.0}
+
+
+def test_shapes_share_the_kernel_that_looks_at_them():
+    """With the number of a shape within it, it would be another one for each shape: 80 ms for a box."""
+    shapes = scene_of(*({"type": "cube", "to_world": placed(seed, at=(seed, 0, 0))} for seed in range(3))).shapes()
+    seen = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for shape in shapes:
+            dr.kernel_history_clear()
+            assert len(parts.faces_of(mitsuba(), shape)) == 6
+            seen.append({entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])})
+    assert seen[0] == seen[1] == seen[2] and seen[0]
