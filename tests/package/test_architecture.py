@@ -39,20 +39,20 @@ def tree_of(path):
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
+def statements(node):
+    """All statements within a node but those under TYPE_CHECKING; expressions hold none."""
+    for child in ast.iter_child_nodes(node):
+        typing_only = isinstance(child, ast.If) and getattr(child.test, "id", "") == "TYPE_CHECKING"
+        if isinstance(child, (ast.stmt, ast.excepthandler, ast.match_case)) and not typing_only:
+            yield child
+            yield from statements(child)
+
+
 @cache
 def imports(path):
     """Dotted names imported anywhere in a module but under TYPE_CHECKING; of packages, what is taken from them."""
-    tree = tree_of(path)
-    typing_only = {
-        id(child)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
-        for child in ast.walk(node)
-    }
     found = []
-    for node in ast.walk(tree):
-        if id(node) in typing_only:
-            continue
+    for node in statements(tree_of(path)):
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
