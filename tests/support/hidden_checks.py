@@ -20,7 +20,7 @@ MOST_MISSED, MOST_EXTRA = 0.02, 0.01
 #: Share of the runs of a scene that may have more wrong than their audits say.
 MOST_BROKEN = 0.05
 #: Rays of the truth. Uniform ones, as it has them, meet a spark once in a thousand.
-RAYS = dict.fromkeys(hidden_scenes.SCENES, 1024) | {"400 sparks": 4096}
+RAYS = dict.fromkeys(hidden_scenes.SCENES, 1024) | {"400 sparks": 4096, "pop-in plates": 256}
 
 
 def sensor():

@@ -178,7 +178,7 @@ def test_quality_is_reached_and_the_error_that_is_told_is_the_error(name):
 def test_the_mean_has_no_bias():
     """Twelve seeds at a coarse quality: mean of all pixels' deviations over its own standard error, 4.4 is 1e-5."""
     scene, sensor = hr.load_scene("camera-sweep"), noisy()
-    truth, own = long_traces(scene, sensor, 0.0, 1000.0, seeds=(901, 902, 903, 904))
+    truth, own = long_traces(scene, sensor, 0.0, 1000.0, 1024, seeds=(901, 902, 903, 904))
     pixels = np.arange(64 * 48, dtype=np.uint32)
     means = []
     for seed in range(12):
@@ -186,7 +186,7 @@ def test_the_mean_has_no_bias():
         a, b = (np.array(half, np.float64) for half in source.mean_flux(pixels, 0.0, 1000.0))
         means.append(np.mean((a + b) / 2 - truth))
     error = np.hypot(np.std(means, ddof=1) / 12**0.5, np.sqrt(np.mean(own**2) / own.size))
-    assert error < 5e-4 * truth.mean()
+    assert error < 2e-4 * truth.mean()  # 1.0e-4, nearly all of it from the runs
     assert abs(np.mean(means)) < 4.4 * error
 
 
