@@ -191,10 +191,10 @@ def plan(
             out.rendered[1:last] |= out.barred[1:last]
             out.asked[:] &= ~out.barred
     # rays, estimator and expected error of every pair; many windows are interpolated from the ends of a block
-    for window in range(count):
+    for window, some in enumerate(map(np.flatnonzero, out.rendered)):
         at_end = is_knot and window in (0, last)
-        part = allocate(pilot, window, sites, units, quality, gain, tuning, at_end)
-        out.rays[window], out.controlled[window], out.error[window], out.floor[window] = part
+        part = allocate(pilot, window, sites.only(some), units, quality, gain, tuning, at_end)
+        out.rays[window, some], out.controlled[window, some], out.error[window, some], out.floor[window, some] = part
     # where little changes, few rays of a difference do what many rays of the pair alone would
     chosen = differences(pilot, sites, units, quality, out.rendered, out.rays, tuning)
     if follows and last > 1:

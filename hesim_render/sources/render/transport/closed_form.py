@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.backend import select
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import (
     DeviceArray,
@@ -31,6 +32,7 @@ from hesim_render.core.device_types import (
 )
 from hesim_render.sources.render.scene.mitsuba_version import mesh_faces, mesh_vertices
 from hesim_render.sources.render.transport.intersections import meets_ball, to_ball, to_face
+from hesim_render.sources.render.transport.sheets import DeviceSheet, Sheet, sheets_of
 
 #: Largest number of faces and balls that are tested one by one: paths of four segments among 3, 6, 12, 24, 48 faces
 #: took 0.93, 0.83, 1.06, 1.08 and 1.7 times as long as with Embree (AVX-512).
@@ -140,20 +142,27 @@ class Ball:
 
 @dataclass(frozen=True)
 class SimpleForm:
-    """Faces and balls, each with its Mitsuba shape."""
+    """Faces and balls, each with its Mitsuba shape, and sheets with the meshes that they are of."""
 
     faces: list[tuple[Face, MitsubaObject]]
     balls: list[tuple[Ball, MitsubaObject]]
+    sheets: list[Sheet]
+    meshes: list[MitsubaObject]
 
     @classmethod
     def of(cls, mi: MitsubaModule, scene: MitsubaObject) -> SimpleForm | None:
-        """The faces and balls of a scene; None if it has other shapes, or too many."""
-        form, shapes = cls([], []), scene.shapes()
+        """The faces and balls of a scene, or its sheets and balls; None if it has other shapes, or too many."""
+        shapes = scene.shapes()
         balls = [shape for shape in shapes if shape.class_name() == "Sphere"]
         meshes = [shape for shape in shapes if shape.is_mesh()]
+        form = cls([], [], [], meshes)
         # known before any shape is looked at, which takes a kernel for each
         if len(balls) + sum(mesh.face_count() for mesh in meshes) / 2 > _MOST:
-            return None
+            # what a GPU's own units for triangles take was not compared
+            if balls or len(meshes) < len(shapes) or select().backend == "cuda":
+                return None
+            form.sheets.extend(sheets_of(meshes))
+            return form if form.sheets else None
         for shape in shapes:
             if shape.class_name() == "Sphere":
                 form.balls.append((_ball_around(shape.bbox(), 3**-0.5), shape))
@@ -183,6 +192,7 @@ class Part:
         self._balls: list[tuple[Point3, Float, MitsubaObject]] = []
         #: For each face: rows of the map to u, v and height; number of its first triangle; its shape.
         self._faces: list[tuple[list[tuple[Vector3, Float]], int, MitsubaObject]] = []
+        self._sheets: list[DeviceSheet] = []
         #: Mitsuba's surface data of the faces: one value for both triangles, or one for each.
         self._surfaces: list[dict[str, list[Any]]] = []
         #: The scene that Mitsuba intersects, and the ball around it.
@@ -196,6 +206,7 @@ class Part:
                 self._surfaces.append({name: _on_device(mi, value) for name, value in face.surface.items()})
             for ball, shape in self.form.balls:
                 self._balls.append((mi.Point3f(ball.middle), mi.Float(ball.square), mi.ShapePtr(shape)))
+            self._sheets = [DeviceSheet(mi, sheet, self.form.meshes) for sheet in self.form.sheets]
         else:
             self._scene = scene
             # somewhat widened: rounding must not take a rim
@@ -244,6 +255,15 @@ class Part:
             is_nearer = active & inside & (t >= 0) & (t < end)
             end, face = take(is_nearer, t, shape), dr.select(is_nearer, number, face)
             hit.prim_uv = dr.select(is_nearer, place, hit.prim_uv)
+        for sheet in self._sheets:
+            t, is_met, place, triangle = sheet.meet(ray, active & (end > 0))
+            is_nearer = is_met & (t < end)
+            own_shape, prim = sheet.owner(triangle, is_nearer)
+            end = take(is_nearer, t, own_shape)
+            hit.prim_uv, hit.prim_index = (
+                dr.select(is_nearer, place, hit.prim_uv),
+                dr.select(is_nearer, prim, hit.prim_index),
+            )
         return hit, face
 
     def blocks(self, ray: Ray, active: Mask) -> Mask:
@@ -257,6 +277,8 @@ class Part:
         for rows, _, _ in self._faces:
             t, _, inside = to_face(ray, rows)
             blocked |= inside & (t >= 0) & (t < ray.maxt)
+        for sheet in self._sheets:
+            blocked |= sheet.blocks(ray, active & ~blocked)
         return blocked & active
 
     def describe_faces(self, si: Interaction, hit: Interaction, face: UInt32) -> None:

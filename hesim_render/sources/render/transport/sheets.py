@@ -1,0 +1,245 @@
+"""Sheets: triangles in one plane, of one mesh or of several. Test targets are made of them.
+
+A ray meets the plane once. A grid on the plane then names the few triangles that may hold the point, which are tested
+within the kernel. A tree of boxes, for which rays leave the kernel, takes several times as long for thousands of
+triangles in one plane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.device import dr
+from hesim_render.core.device_types import Float, Mask, MitsubaModule, MitsubaObject, Point2, Ray, UInt32
+from hesim_render.core.tables import table
+from hesim_render.sources.render.scene.mitsuba_version import mesh_faces, mesh_vertices
+from hesim_render.sources.render.transport.intersections import to_face
+
+#: Largest number of triangles of all sheets of a part, and of planes.
+_MOST_TRIANGLES, _MOST_PLANES = 1 << 16, 3
+#: Largest distance of a corner from its plane, and width of the seam that is closed between two triangles, over the
+#: largest coordinate: what float32 rounds.
+_ROUNDING, _SEAM = 2e-6, 2e-7
+#: Cells per triangle of a grid, and most cells along a side.
+_CELLS, _MOST_CELLS = 32, 512
+#: Numbers of a row: those that map a place on the sheet to two barycentric coordinates, the seam, and the triangle.
+_ROW = 8
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Triangles in one plane.
+
+    Parameters
+    ----------
+    corners : [n, 3, 3], m.
+    owner : [n, 2], number of the mesh and of the triangle in it.
+    """
+
+    corners: NDArray[np.float64]
+    owner: NDArray[np.uint32]
+
+
+def sheets_of(shapes: Sequence[MitsubaObject]) -> list[Sheet]:
+    """The planes in which all triangles of some meshes lie; none if there are too many.
+
+    Parameters
+    ----------
+    shapes : meshes.
+    """
+    counts = [shape.face_count() for shape in shapes]
+    if not counts or sum(counts) > _MOST_TRIANGLES:
+        return []
+    corners = np.concatenate([mesh_vertices(shape)[mesh_faces(shape)] for shape in shapes]).astype(np.float64)
+    owner = np.stack(
+        [np.repeat(np.arange(len(counts)), counts), np.concatenate([np.arange(count) for count in counts])], axis=1
+    )
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(normals, axis=1)
+    # a triangle without an area is hit by no ray
+    left = areas > 0
+    most_m, out = _ROUNDING * float(np.abs(corners).max()), list[Sheet]()
+    while left.any():
+        if len(out) == _MOST_PLANES:
+            return []
+        # the plane of the largest triangle, whose normal is known best
+        seed = int(np.argmax(np.where(left, areas, 0)))
+        heights = (corners - corners[seed, 0]) @ (normals[seed] / areas[seed])
+        own = left & (np.abs(heights).max(axis=1) <= most_m)
+        out.append(Sheet(corners[own], owner[own].astype(np.uint32)))
+        left &= ~own
+    return out
+
+
+class DeviceSheet:
+    """A sheet on the device.
+
+    Parameters
+    ----------
+    mi : the mitsuba module.
+    sheet : the triangles.
+    shapes : the meshes.
+    """
+
+    def __init__(self, mi: MitsubaModule, sheet: Sheet, shapes: Sequence[MitsubaObject]) -> None:
+        self._mi = mi
+        to_uvh, uv = _frame(sheet.corners)
+        self._rows = [(mi.Vector3f(row[:3]), mi.Float(float(row[3]))) for row in to_uvh]
+        side = int(np.clip(np.ceil(np.sqrt(_CELLS * len(uv))), 1, _MOST_CELLS))
+        first, triangle = _cells(uv, side)
+        maps, seam = _barycentric(uv, _SEAM * float(np.abs(sheet.corners).max()), to_uvh)
+        rows = np.zeros((triangle.size + 1, _ROW), np.float32)
+        rows[:-1, :6], rows[:-1, 6] = maps[triangle].reshape(-1, 6), seam[triangle]
+        rows[:-1, 7] = triangle.astype(np.uint32).view(np.float32)
+        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
+        self._first, self._triangles = table(mi.UInt32, first.astype(np.uint32)), table(mi.Float, rows)
+        self._shape = table(mi.UInt32, np.array(numbers, np.uint32)[sheet.owner[:, 0]])
+        self._prim = table(mi.UInt32, sheet.owner[:, 1])
+        self._side = mi.UInt32(side)
+        dr.make_opaque(self._rows, self._side)
+
+    def meet(self, ray: Ray, active: Mask) -> tuple[Float, Mask, Point2, UInt32]:
+        """Where rays meet the plane, before `maxt`, and the triangle there.
+
+        Returns
+        -------
+        t : distance, m.
+        is_met : True where a triangle is met.
+        place : barycentric coordinates of its second and third corner.
+        triangle : its number.
+        """
+        mi = self._mi
+        t, place, last, cell = self._start(ray, active)
+
+        def step(row: UInt32, best: Float, best_row: UInt32) -> tuple[UInt32, Float, UInt32]:
+            margin, _ = self._inside(row, place)
+            is_better = margin > best
+            return row + 1, dr.select(is_better, margin, best), dr.select(is_better, row, best_row)
+
+        # of two triangles on both sides of a seam, the one that holds the point
+        begin = mi.Float(-1), mi.UInt32(0)
+        _, best, row = dr.while_loop(
+            (cell, *begin), lambda row, *_: row < last, step, labels=("row", "best", "best_row"), label="sheet"
+        )
+        is_met = best >= 0
+        _, at = self._inside(row, place, is_met)
+        bits = dr.gather(mi.Float, self._triangles, row * _ROW + 7, is_met)
+        return t, is_met, at, dr.reinterpret_array(mi.UInt32, bits)
+
+    def owner(self, triangle: UInt32, active: Mask) -> tuple[MitsubaObject, UInt32]:
+        """Shape of a triangle, and its number there."""
+        shape = dr.gather(self._mi.UInt32, self._shape, triangle, active)
+        return dr.reinterpret_array(self._mi.ShapePtr, shape), dr.gather(self._mi.UInt32, self._prim, triangle, active)
+
+    def blocks(self, ray: Ray, active: Mask) -> Mask:
+        """True where a triangle is met before `maxt`."""
+        _, place, last, cell = self._start(ray, active)
+
+        def step(row: UInt32, is_met: Mask) -> tuple[UInt32, Mask]:
+            return row + 1, is_met | (self._inside(row, place)[0] >= 0)
+
+        _, is_met = dr.while_loop(
+            (cell, self._mi.Bool(False)),
+            lambda row, is_met: (row < last) & ~is_met,
+            step,
+            labels=("row", "is_met"),
+            label="sheet",
+        )
+        blocked: Mask = is_met
+        return blocked
+
+    def _start(self, ray: Ray, active: Mask) -> tuple[Float, Point2, UInt32, UInt32]:
+        """Distance to the plane, the place there, and the end and begin of the rows of its cell."""
+        mi = self._mi
+        t, place, inside = to_face(ray, self._rows)
+        active = active & inside & (t >= 0) & (t < ray.maxt)
+        col, row = (dr.minimum(mi.UInt32(at * mi.Float(self._side)), self._side - 1) for at in place)
+        cell = row * self._side + col
+        return (
+            t,
+            place,
+            dr.gather(mi.UInt32, self._first, cell + 1, active),
+            dr.gather(mi.UInt32, self._first, cell, active),
+        )
+
+    def _inside(self, row: UInt32, place: Point2, active: Mask | bool = True) -> tuple[Float, Point2]:
+        """How far inside of the triangle of a row a place lies, 0 or more there; and its barycentric coordinates."""
+        mi = self._mi
+        one, two = (dr.gather(mi.Vector4f, self._triangles, 2 * row + half, mi.Bool(active)) for half in (0, 1))
+        second = dr.fma(one.x, place.x, dr.fma(one.y, place.y, one.z))
+        third = dr.fma(one.w, place.x, dr.fma(two.x, place.y, two.y))
+        margin = dr.minimum(dr.minimum(second, third), 1 - second - third)
+        return margin + two.z, mi.Point2f(second, third)
+
+
+def _frame(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Map [3, 4] of a point to its place on the smallest rectangle around the triangles, 0 to 1 in u and v, and its
+    height, m; and the places of the corners, [n, 3, 2].
+    """
+    sides = corners[:, 1:] - corners[:, :1]
+    normals = np.cross(sides[:, 0], sides[:, 1])
+    largest = int(np.argmax(np.linalg.norm(normals, axis=1)))
+    normal = normals[largest] / np.linalg.norm(normals[largest])
+    along = sides[largest, 0] / np.linalg.norm(sides[largest, 0])
+    axes = np.stack([along, np.cross(normal, along), normal])
+    points = corners.reshape(-1, 3) @ axes.T
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = high - low
+    # the height is not scaled; it is counted from the middle of what rounding has made of the plane
+    origin, size = np.append(low[:2], points[:, 2].mean()), np.append(size[:2], 1.0)
+    to_uvh = np.concatenate([axes, -origin[:, None]], axis=1) / size[:, None]
+    return to_uvh, ((points - origin) / size)[:, :2].reshape(-1, 3, 2)
+
+
+def _barycentric(
+    uv: NDArray[np.float64], seam_m: float, to_uvh: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Maps of a place (u, v, 1) to the barycentric coordinates of the second and third corner, [n, 2, 3]; and the width
+    of the seam in these coordinates, [n].
+    """
+    sides = np.swapaxes(uv[:, 1:] - uv[:, :1], 1, 2)
+    area = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
+    inverse = np.stack([sides[:, 1, 1], -sides[:, 0, 1], -sides[:, 1, 0], sides[:, 0, 0]], axis=1).reshape(-1, 2, 2)
+    inverse /= area[:, None, None]
+    maps = np.concatenate([inverse, -(inverse @ uv[:, 0, :, None])], axis=2)
+    # change of each coordinate per metre, in the plane
+    per_m = np.linalg.norm(to_uvh[:2, :3], axis=1)
+    slopes = np.stack([maps[:, 0, :2], maps[:, 1, :2], maps.sum(axis=1)[:, :2]], axis=1) * per_m
+    return maps, seam_m * np.linalg.norm(slopes, axis=2).max(axis=1)
+
+
+def _cells(uv: NDArray[np.float64], side: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Triangles that touch each cell of a grid of `side` × `side`: place of the first one of each cell, [side² + 1],
+    and their numbers, cell by cell.
+    """
+    # rounding on the device may move a point into the next cell
+    margin = 1e-4
+    low, high = uv.min(axis=1) * side - margin, uv.max(axis=1) * side + margin
+    first = np.clip(np.floor(low).astype(np.int64), 0, side - 1)
+    count = np.clip(np.floor(high).astype(np.int64), 0, side - 1) - first + 1
+    # all cells of the rectangle around each triangle
+    each = count.prod(axis=1)
+    triangle = np.repeat(np.arange(len(uv)), each)
+    number = np.arange(triangle.size) - np.repeat(np.cumsum(each) - each, each)
+    row, col = np.divmod(number, count[triangle, 0])
+    cell = np.stack([col, row], axis=1) + first[triangle]
+    # a cell lies outside of a triangle if all of it lies beyond one of its sides
+    corner = uv * side
+    begin, along = corner, np.roll(corner, -1, axis=1) - corner
+    inward = np.stack([-along[..., 1], along[..., 0]], axis=2)
+    turn = np.sign(along[:, 0, 0] * along[:, 1, 1] - along[:, 0, 1] * along[:, 1, 0])
+    inward *= turn[:, None, None]
+    keep = np.ones(triangle.size, np.bool_)
+    for edge in range(3):
+        normal = inward[triangle, edge]
+        # the corner of the cell that lies farthest inward
+        farthest = cell + (normal > 0) + np.where(normal > 0, margin, -margin)
+        keep &= ((farthest - begin[triangle, edge]) * normal).sum(axis=1) >= 0
+    number = cell[keep, 1] * side + cell[keep, 0]
+    order = np.argsort(number, kind="stable")
+    ends = np.cumsum(np.bincount(number, minlength=side * side))
+    return np.append(0, ends), triangle[keep][order]
