@@ -187,7 +187,10 @@ def test_a_ray_leaves_the_face_it_starts_from():
     [
         pytest.param(lambda: [{"type": "cylinder"}], id="cylinder"),
         pytest.param(lambda: [{"type": "rectangle"}, {"type": "disk"}], id="a disk too"),
-        pytest.param(lambda: [{"type": "rectangle"}] * (parts._MOST + 1), id="too many"),
+        pytest.param(
+            lambda: [{"type": "rectangle", "to_world": placed(k, at=(0, 0, 0.1 * k))} for k in range(parts._MOST + 1)],
+            id="too many",
+        ),
         pytest.param(lambda: [mesh(SQUARE[:3], [[0, 1, 2]])], id="one triangle"),
         pytest.param(
             lambda: [mesh(np.add(SQUARE, [[0.1 * (k == 2), 0, 0] for k in range(4)]), HALVES)], id="trapezium"

@@ -271,7 +271,7 @@ def ball_around(group: Group) -> tuple[float, float, float, float]:
     """Centre and radius of a ball that contains an object at rest, m."""
     low, high = group.corners.min(axis=0), group.corners.max(axis=0)
     form = group.part.form
-    if form is not None and len(form.balls) == 1 and not form.faces and not form.sheets:
+    if form is not None and len(form.balls) == 1 and not form.faces:
         radius = float((high - low).max()) / 2
     else:
         radius = float(np.linalg.norm(high - low)) / 2

@@ -155,11 +155,13 @@ def differences(
         is_aimed = pilot.aims.at(which, sites.listed[place]).count > 0
         out.rays[which[is_aimed], place[is_aimed]] = 0
     # all windows between take as many rays as the one that needs most, and together pay for those in the first window
-    own = out.rays[inner]
+    some = np.flatnonzero(out.rays[inner].any(axis=0))
+    own = out.rays[inner, some]
     most = own.max(axis=0, initial=0)
     # rays that all inner windows of a pixel save together, [pixel], against `most` rays once more in the first window
-    saved = np.where(own > 0, alone[inner].astype(np.int32) - most, 0).sum(axis=0)
-    own[:] = np.where((own > 0) & (saved > most), most, 0)
+    saved = np.where(own > 0, alone[inner, some].astype(np.int32) - most, 0).sum(axis=0)
+    out.rays[inner, some] = np.where((own > 0) & (saved > most), most, 0)
     # from the scatter of single differences to the error of their mean
-    out.error[:] *= np.float32(tuning.difference_factor) / np.sqrt(np.maximum(out.rays, 1).astype(np.float32))
+    pairs = out.rays > 0
+    out.error[pairs] *= np.float32(tuning.difference_factor) / np.sqrt(out.rays[pairs].astype(np.float32))
     return out

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.device import dr
-from hesim_render.core.device_types import Float, Mask, MitsubaModule, MitsubaObject, Point2, Ray, UInt32
+from hesim_render.core.device_types import Bands, Float, Mask, MitsubaModule, MitsubaObject, Point2, Ray, UInt32
 from hesim_render.core.tables import table
 from hesim_render.sources.render.scene.mitsuba_version import mesh_faces, mesh_vertices
 from hesim_render.sources.render.transport.intersections import to_face
@@ -26,8 +26,9 @@ _MOST_TRIANGLES, _MOST_PLANES = 1 << 16, 3
 _ROUNDING, _SEAM = 2e-6, 2e-7
 #: Cells per triangle of a grid, and most cells along a side.
 _CELLS, _MOST_CELLS = 32, 512
-#: Numbers of a row: those that map a place on the sheet to two barycentric coordinates, the seam, and the triangle.
-_ROW = 8
+#: Numbers of a row: those that map a place on the sheet to its distances from the three sides of a triangle, m; the
+#: triangle; and the inverse distances of its second and third corner from the sides opposite to them.
+_ROW = 12
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,9 @@ def sheets_of(shapes: Sequence[MitsubaObject]) -> list[Sheet]:
     )
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(normals, axis=1)
-    # a triangle without an area is hit by no ray
-    left = areas > 0
     most_m, out = _ROUNDING * float(np.abs(corners).max()), list[Sheet]()
+    # a triangle without an area is hit by no ray
+    left = areas > most_m**2
     while left.any():
         if len(out) == _MOST_PLANES:
             return []
@@ -91,16 +92,17 @@ class DeviceSheet:
         self._rows = [(mi.Vector3f(row[:3]), mi.Float(float(row[3]))) for row in to_uvh]
         side = int(np.clip(np.ceil(np.sqrt(_CELLS * len(uv))), 1, _MOST_CELLS))
         first, triangle = _cells(uv, side)
-        maps, seam = _barycentric(uv, _SEAM * float(np.abs(sheet.corners).max()), to_uvh)
+        maps, per_m = _distances(uv, to_uvh)
         rows = np.zeros((triangle.size + 1, _ROW), np.float32)
-        rows[:-1, :6], rows[:-1, 6] = maps[triangle].reshape(-1, 6), seam[triangle]
-        rows[:-1, 7] = triangle.astype(np.uint32).view(np.float32)
-        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
+        rows[:-1, :9], rows[:-1, 10:] = maps[triangle].reshape(-1, 9), per_m[triangle, 1:]
+        rows[:-1, 9] = triangle.astype(np.uint32).view(np.float32)
+        pointers: list[UInt32] = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)) for shape in shapes]
+        numbers = [int(pointer[0]) for pointer in pointers]
         self._first, self._triangles = table(mi.UInt32, first.astype(np.uint32)), table(mi.Float, rows)
         self._shape = table(mi.UInt32, np.array(numbers, np.uint32)[sheet.owner[:, 0]])
         self._prim = table(mi.UInt32, sheet.owner[:, 1])
-        self._side = mi.UInt32(side)
-        dr.make_opaque(self._rows, self._side)
+        self._side, self._seam = mi.UInt32(side), mi.Float(_SEAM * float(np.abs(sheet.corners).max()))
+        dr.make_opaque(self._rows, self._side, self._seam)
 
     def meet(self, ray: Ray, active: Mask) -> tuple[Float, Mask, Point2, UInt32]:
         """Where rays meet the plane, before `maxt`, and the triangle there.
@@ -115,20 +117,23 @@ class DeviceSheet:
         mi = self._mi
         t, place, last, cell = self._start(ray, active)
 
-        def step(row: UInt32, best: Float, best_row: UInt32) -> tuple[UInt32, Float, UInt32]:
-            margin, _ = self._inside(row, place)
-            is_better = margin > best
-            return row + 1, dr.select(is_better, margin, best), dr.select(is_better, row, best_row)
+        def step(row: UInt32, most: Float, own: UInt32) -> tuple[UInt32, Float, UInt32]:
+            margin, *_ = self._inside(row, place)
+            is_better = margin > most
+            return row + 1, dr.select(is_better, margin, most), dr.select(is_better, row, own)
 
-        # of two triangles on both sides of a seam, the one that holds the point
-        begin = mi.Float(-1), mi.UInt32(0)
-        _, best, row = dr.while_loop(
-            (cell, *begin), lambda row, *_: row < last, step, labels=("row", "best", "best_row"), label="sheet"
+        # at a seam, the triangle that holds the point, or comes nearest to it
+        _, margin, row = dr.while_loop(
+            (cell, -self._seam, mi.UInt32(0)),
+            lambda row, *_: row < last,
+            step,
+            labels=("row", "margin", "own"),
+            label="sheet",
         )
-        is_met = best >= 0
-        _, at = self._inside(row, place, is_met)
-        bits = dr.gather(mi.Float, self._triangles, row * _ROW + 7, is_met)
-        return t, is_met, at, dr.reinterpret_array(mi.UInt32, bits)
+        is_met = margin > -self._seam
+        _, second, third, rest = self._inside(row, place, is_met)
+        triangle: UInt32 = dr.reinterpret_array(mi.UInt32, rest.y)
+        return t, is_met, mi.Point2f(second * rest.z, third * rest.w), triangle
 
     def owner(self, triangle: UInt32, active: Mask) -> tuple[MitsubaObject, UInt32]:
         """Shape of a triangle, and its number there."""
@@ -140,7 +145,7 @@ class DeviceSheet:
         _, place, last, cell = self._start(ray, active)
 
         def step(row: UInt32, is_met: Mask) -> tuple[UInt32, Mask]:
-            return row + 1, is_met | (self._inside(row, place)[0] >= 0)
+            return row + 1, is_met | (self._inside(row, place)[0] > -self._seam)
 
         _, is_met = dr.while_loop(
             (cell, self._mi.Bool(False)),
@@ -166,14 +171,16 @@ class DeviceSheet:
             dr.gather(mi.UInt32, self._first, cell, active),
         )
 
-    def _inside(self, row: UInt32, place: Point2, active: Mask | bool = True) -> tuple[Float, Point2]:
-        """How far inside of the triangle of a row a place lies, 0 or more there; and its barycentric coordinates."""
+    def _inside(self, row: UInt32, place: Point2, active: Mask | bool = True) -> tuple[Float, Float, Float, Bands]:
+        """Least distance of a place from the sides of the triangle of a row, m, positive inside; those from the sides
+        opposite to its second and third corner; and the last numbers of the row.
+        """
         mi = self._mi
-        one, two = (dr.gather(mi.Vector4f, self._triangles, 2 * row + half, mi.Bool(active)) for half in (0, 1))
-        second = dr.fma(one.x, place.x, dr.fma(one.y, place.y, one.z))
-        third = dr.fma(one.w, place.x, dr.fma(two.x, place.y, two.y))
-        margin = dr.minimum(dr.minimum(second, third), 1 - second - third)
-        return margin + two.z, mi.Point2f(second, third)
+        one, two, rest = (dr.gather(mi.Vector4f, self._triangles, 3 * row + part, mi.Bool(active)) for part in range(3))
+        first = dr.fma(one.x, place.x, dr.fma(one.y, place.y, one.z))
+        second = dr.fma(one.w, place.x, dr.fma(two.x, place.y, two.y))
+        third = dr.fma(two.z, place.x, dr.fma(two.w, place.y, rest.x))
+        return dr.minimum(first, dr.minimum(second, third)), second, third, rest
 
 
 def _frame(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -195,21 +202,16 @@ def _frame(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
     return to_uvh, ((points - origin) / size)[:, :2].reshape(-1, 3, 2)
 
 
-def _barycentric(
-    uv: NDArray[np.float64], seam_m: float, to_uvh: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Maps of a place (u, v, 1) to the barycentric coordinates of the second and third corner, [n, 2, 3]; and the width
-    of the seam in these coordinates, [n].
+def _distances(uv: NDArray[np.float64], to_uvh: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Maps of a place (u, v, 1) to its distances from the sides opposite to the three corners, m, [n, 3, 3]; and the
+    inverse distances of the corners themselves, [n, 3].
     """
-    sides = np.swapaxes(uv[:, 1:] - uv[:, :1], 1, 2)
-    area = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
-    inverse = np.stack([sides[:, 1, 1], -sides[:, 0, 1], -sides[:, 1, 0], sides[:, 0, 0]], axis=1).reshape(-1, 2, 2)
-    inverse /= area[:, None, None]
-    maps = np.concatenate([inverse, -(inverse @ uv[:, 0, :, None])], axis=2)
-    # change of each coordinate per metre, in the plane
-    per_m = np.linalg.norm(to_uvh[:2, :3], axis=1)
-    slopes = np.stack([maps[:, 0, :2], maps[:, 1, :2], maps.sum(axis=1)[:, :2]], axis=1) * per_m
-    return maps, seam_m * np.linalg.norm(slopes, axis=2).max(axis=1)
+    # barycentric coordinates are 1 at their own corner and 0 at both others
+    coordinates = np.linalg.inv(np.concatenate([uv, np.ones((len(uv), 3, 1))], axis=2)).transpose(0, 2, 1)
+    # their slopes, which are the inverse distances of the corners
+    slopes = coordinates[..., :2] * np.linalg.norm(to_uvh[:2, :3], axis=1)
+    per_m = np.linalg.norm(slopes, axis=2)
+    return coordinates / per_m[..., None], per_m
 
 
 def _cells(uv: NDArray[np.float64], side: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
