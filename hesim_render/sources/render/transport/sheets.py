@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import log2
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,8 @@ _MOST_TRIANGLES, _MOST_PLANES = 1 << 16, 3
 #: Largest distance of a corner from its plane, and width of the seam that is closed between two triangles, over the
 #: largest coordinate: what float32 rounds.
 _ROUNDING, _SEAM = 2e-6, 2e-7
-#: Cells per triangle of a grid, and most cells along a side.
-_CELLS, _MOST_CELLS = 32, 512
+#: Cells per triangle of a grid, about, and how often its sides are halved, at most.
+_CELLS, _MOST_HALVINGS = 16, 9
 #: Numbers of a row: those that map a place on the sheet to its distances from the three sides of a triangle, m; the
 #: triangle; and the inverse distances of its second and third corner from the sides opposite to them.
 _ROW = 12
@@ -90,8 +91,8 @@ class DeviceSheet:
         self._mi = mi
         to_uvh, uv = _frame(sheet.corners)
         self._rows = [(mi.Vector3f(row[:3]), mi.Float(float(row[3]))) for row in to_uvh]
-        side = int(np.clip(np.ceil(np.sqrt(_CELLS * len(uv))), 1, _MOST_CELLS))
-        first, triangle = _cells(uv, side)
+        halvings = min(round(log2(_CELLS * len(uv)) / 2), _MOST_HALVINGS)
+        first, triangle = _cells(uv, halvings)
         maps, per_m = _distances(uv, to_uvh)
         rows = np.zeros((triangle.size + 1, _ROW), np.float32)
         rows[:-1, :9], rows[:-1, 10:] = maps[triangle].reshape(-1, 9), per_m[triangle, 1:]
@@ -101,7 +102,7 @@ class DeviceSheet:
         self._first, self._triangles = table(mi.UInt32, first.astype(np.uint32)), table(mi.Float, rows)
         self._shape = table(mi.UInt32, np.array(numbers, np.uint32)[sheet.owner[:, 0]])
         self._prim = table(mi.UInt32, sheet.owner[:, 1])
-        self._side, self._seam = mi.UInt32(side), mi.Float(_SEAM * float(np.abs(sheet.corners).max()))
+        self._side, self._seam = mi.UInt32(2**halvings), mi.Float(_SEAM * float(np.abs(sheet.corners).max()))
         dr.make_opaque(self._rows, self._side, self._seam)
 
     def meet(self, ray: Ray, active: Mask) -> tuple[Float, Mask, Point2, UInt32]:
@@ -214,34 +215,30 @@ def _distances(uv: NDArray[np.float64], to_uvh: NDArray[np.float64]) -> tuple[ND
     return coordinates / per_m[..., None], per_m
 
 
-def _cells(uv: NDArray[np.float64], side: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Triangles that touch each cell of a grid of `side` × `side`: place of the first one of each cell, [side² + 1],
-    and their numbers, cell by cell.
+def _cells(uv: NDArray[np.float64], halvings: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Triangles that touch each cell of a grid of 2^halvings cells a side: place of the first one of each cell, [cells
+    + 1], and their numbers, cell by cell.
     """
     # rounding on the device may move a point into the next cell
     margin = 1e-4
-    low, high = uv.min(axis=1) * side - margin, uv.max(axis=1) * side + margin
-    first = np.clip(np.floor(low).astype(np.int64), 0, side - 1)
-    count = np.clip(np.floor(high).astype(np.int64), 0, side - 1) - first + 1
-    # all cells of the rectangle around each triangle
-    each = count.prod(axis=1)
-    triangle = np.repeat(np.arange(len(uv)), each)
-    number = np.arange(triangle.size) - np.repeat(np.cumsum(each) - each, each)
-    row, col = np.divmod(number, count[triangle, 0])
-    cell = np.stack([col, row], axis=1) + first[triangle]
-    # a cell lies outside of a triangle if all of it lies beyond one of its sides
-    corner = uv * side
-    begin, along = corner, np.roll(corner, -1, axis=1) - corner
-    inward = np.stack([-along[..., 1], along[..., 0]], axis=2)
+    low, high, along = uv.min(axis=1), uv.max(axis=1), np.roll(uv, -1, axis=1) - uv
     turn = np.sign(along[:, 0, 0] * along[:, 1, 1] - along[:, 0, 1] * along[:, 1, 0])
-    inward *= turn[:, None, None]
-    keep = np.ones(triangle.size, np.bool_)
-    for edge in range(3):
-        normal = inward[triangle, edge]
-        # the corner of the cell that lies farthest inward
-        farthest = cell + (normal > 0) + np.where(normal > 0, margin, -margin)
-        keep &= ((farthest - begin[triangle, edge]) * normal).sum(axis=1) >= 0
-    number = cell[keep, 1] * side + cell[keep, 0]
+    # the inside of side k of a triangle is where normal · place is at least its bound
+    normals = np.stack([-along[..., 1], along[..., 0]], axis=2) * turn[:, None, None]
+    bounds = (normals * uv).sum(axis=2)
+    triangle, cell = np.arange(len(uv)), np.zeros((len(uv), 2))
+    quarters = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+    for halving in range(1, halvings + 1):
+        # the quarters of each cell that is touched, in units of their own size
+        triangle, cell, cells = np.repeat(triangle, 4), (2 * cell[:, None] + quarters).reshape(-1, 2), 2**halving
+        keep = ((high[triangle] * cells >= cell - margin) & (low[triangle] * cells <= cell + 1 + margin)).all(axis=1)
+        for side in range(3):
+            normal = normals[triangle, side]
+            # the corner of the cell that lies farthest inside
+            farthest = cell + np.where(normal > 0, 1 + margin, -margin)
+            keep &= (farthest * normal).sum(axis=1) >= bounds[triangle, side] * cells
+        triangle, cell = triangle[keep], cell[keep]
+    number = (cell[:, 1] * 2**halvings + cell[:, 0]).astype(np.int64)
     order = np.argsort(number, kind="stable")
-    ends = np.cumsum(np.bincount(number, minlength=side * side))
-    return np.append(0, ends), triangle[keep][order]
+    ends = np.cumsum(np.bincount(number, minlength=4**halvings))
+    return np.append(0, ends), triangle[order]
