@@ -150,7 +150,7 @@ def plan(
     count, last = pilot.windows, pilot.windows - 1
     shape = count, sites.listed.size
     # noise units of all sites, [window, site]; the pilot has neighbours besides the listed pixels
-    units = np.stack([unit(pilot.flux_of(window)) for window in range(count)])
+    units = np.stack([unit(flux) for flux in pilot.flux])
     out = Plan(
         np.ones(shape, np.bool_),
         np.zeros(shape, np.int16),
