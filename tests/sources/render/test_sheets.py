@@ -171,9 +171,10 @@ def test_planes_are_told_apart():
     three = [wall(np.eye(3), (0, 0, 0.1 * k)) for k in range(4)]
     assert len(sheets_of(three[:3])) == 3
     assert sheets_of(three) == []
-    # a triangle without an area belongs to no plane
-    corners = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [0, 0, 2], [0, 0, 3], [0, 0, 5]])
-    assert len(sheets_of([mesh(corners, [[0, 1, 2], [3, 4, 5]])])[0].corners) == 1
+    # a triangle without an area belongs to no plane, nor one that is smaller than what its corners are rounded by
+    corners = np.array([[0, 0, 5], [1, 0, 5], [0, 1, 5], [0, 0, 2], [0, 0, 3], [0, 0, 1], [1e-6, 0, 1], [0, 1e-6, 1]])
+    (sheet,) = sheets_of([mesh(corners, [[0, 1, 2], [3, 4, 5], [5, 6, 7]])])
+    assert sheet.owner.tolist() == [[0, 0]]
 
 
 def test_what_is_in_no_plane_is_left_to_mitsuba():
