@@ -180,5 +180,6 @@ def test_planes_are_told_apart():
 def test_what_is_in_no_plane_is_left_to_mitsuba():
     mi = mitsuba()
     for shapes in (lifted(0.1), [*patches(), {"type": "sphere", "radius": 0.1}], [*patches(), {"type": "disk"}]):
-        scene = scene_of(*shapes)
-        assert Part(mi, scene, apart=False)._scene is scene
+        part = Part(mi, scene_of(*shapes), apart=False)
+        assert part.form is None
+        assert not part._sheets
