@@ -15,6 +15,7 @@ from hesim_render.cli.exit_status import ExitStatus, Interrupts
 from hesim_render.cli.options import in_options
 from hesim_render.cli.terminal import complain, silence_stdout
 from hesim_render.core.errors import HesimError, HesimWarning
+from hesim_render.core.host_memory import keep_freed_memory
 from hesim_render.core.output import discard_unfinished
 
 #: Text in Dr.Jit's errors.
@@ -28,6 +29,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     output is gone (``| head``), a run continues to its end, and its status is unaffected.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:
+        keep_freed_memory()
     with Interrupts() as interrupts, warnings.catch_warnings():
         warnings.showwarning = _note(warnings.showwarning)
         status = _run(given, interrupts)

@@ -262,7 +262,7 @@ def test_windows_of_looks_are_rounded_outwards_to_eighths_of_their_length():
 
     windows = Windows(np.array([1010.0, 1090.0, 1110.0, 7.4]), np.array([1810.0, 1890.0, 1910.0, 9.5]))
     zoom = SimpleNamespace(_outlines=outlines)
-    Zoom._sites_of(zoom, np.arange(4), np.zeros(4, np.int64), windows, np.arange(4))
+    Zoom._sites_of(zoom, np.arange(4), np.zeros(4, np.int64), (20, 30), (4, 1), windows, np.arange(4))
     assert sorted(asked) == [(7.0, 10.0), (1000.0, 1900.0), (1100.0, 2000.0)]
 
 

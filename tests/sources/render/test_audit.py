@@ -733,4 +733,4 @@ def test_the_rays_of_an_audit_are_its_own_and_its_room_is_shared_by_events_and_f
 def test_places_on_the_event_grid_where_pixels_are_listed_in_any_order():
     """A tile with several event pixels lists them by their place on the grid, not by their number in the mosaic."""
     audit = Audit(NotedFlux.__new__(NotedFlux), None, 0.4, None, np.array([7, 2, 9, 4], np.uint32), 3)
-    assert audit._place(np.array([9, 4, 7], np.uint32)).tolist() == [2, 3, 0]
+    assert audit._place_of[np.array([9, 4, 7], np.uint32)].tolist() == [2, 3, 0]

@@ -124,6 +124,42 @@ def test_hits_and_surfaces_are_those_of_mitsuba(name):
     np.testing.assert_array_equal(blocked, met)
 
 
+@pytest.mark.parametrize(("balls", "apart"), [(1, True), (3, False), (parts._MOST_BALLS + 1, False)])
+def test_a_few_balls_beside_other_shapes_are_met_in_closed_form(balls, apart):
+    """Boxes, a disk and balls that cover one another, one turned inside out."""
+    import drjit as dr
+
+    mi, rng = mitsuba(), np.random.default_rng(9)
+    shapes = [{"type": "cube", "to_world": placed(k, 0.15, rng.uniform(-0.5, 0.5, 3))} for k in range(3)]
+    shapes += [{"type": "disk", "to_world": placed(11, 0.3)}]
+    shapes[1:1] = [
+        {"type": "sphere", "center": rng.uniform(-0.6, 0.6, 3).tolist(), "radius": 0.1 + 0.3 / (k + 1)}
+        for k in range(balls)
+    ]
+    shapes[1]["flip_normals"] = True
+    scene = scene_of(*shapes)
+    part = Part(mi, scene, apart)
+    assert [len(part._balls), part._scene is scene] == ([0, True] if balls > parts._MOST_BALLS else [balls, False])
+    ray, everywhere = rays(), mi.Bool(True)
+    theirs = scene.ray_intersect(ray)
+    hit, face = part.nearest(ray, False, everywhere)
+    ours = surface_of([part], hit, face, ray, mi.RayFlags.All, everywhere)
+    met, wanted = np.array(hit.is_valid()), np.array(theirs.is_valid())
+    assert 0.05 < wanted.mean() < 0.95
+    assert np.mean(met == wanted) > 0.9999
+    both = met & wanted
+    told, known = (dr.reinterpret_array(mi.UInt32, si.shape) for si in (ours, theirs))
+    same = both & (np.array(told) == np.array(known))
+    assert same.sum() > 0.9999 * both.sum()
+    for told, known in [(ours.t, theirs.t), (ours.p, theirs.p), (ours.n, theirs.n), (ours.wi, theirs.wi)]:
+        off = np.abs(np.array(told)[..., same] - np.array(known)[..., same])
+        assert np.mean(off < 2e-4) > 0.9995
+    asked = mi.Bool(np.arange(COUNT) % 3 != 1)
+    blocked = np.array(part.blocks(ray, asked))
+    assert np.mean(blocked == np.array(scene.ray_test(ray, asked))) > 0.9999
+    np.testing.assert_array_equal(np.array(part.nearest(ray, False, asked)[0].is_valid()), met & np.array(asked))
+
+
 def test_masked_lanes_meet_nothing():
     mi = mitsuba()
     part = Part(mi, scene_of(*BOXES["all together"]()), apart=False)
@@ -188,7 +224,10 @@ def test_a_ray_leaves_the_face_it_starts_from():
     [
         pytest.param(lambda: [{"type": "cylinder"}], id="cylinder"),
         pytest.param(lambda: [{"type": "rectangle"}, {"type": "disk"}], id="a disk too"),
-        pytest.param(lambda: [{"type": "rectangle"}] * (parts._MOST + 1), id="too many"),
+        pytest.param(
+            lambda: [{"type": "rectangle", "to_world": placed(k, at=(0, 0, 0.1 * k))} for k in range(parts._MOST + 1)],
+            id="too many",
+        ),
         pytest.param(lambda: [mesh(SQUARE[:3], [[0, 1, 2]])], id="one triangle"),
         pytest.param(
             lambda: [mesh(np.add(SQUARE, [[0.1 * (k == 2), 0, 0] for k in range(4)]), HALVES)], id="trapezium"

@@ -69,7 +69,10 @@ class Audit:
         seed: int,
     ) -> None:
         self._noted, self._source, self._quality, self._noise = noted, source, quality, noise
-        self._event_pixel, self._in_order = event_pixel, np.argsort(event_pixel)
+        #: Places of mosaic indices on the event grid.
+        #: Places of mosaic indices on the event grid.
+        self._place_of = np.zeros(int(event_pixel.max(initial=0)) + 1, np.int64)
+        self._place_of[event_pixel] = np.arange(event_pixel.size)
         self._rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, 2]))
 
     def run(self) -> dict[str, Any]:
@@ -218,18 +221,14 @@ class Audit:
     def _log(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64]) -> NDArray[np.float64]:
         """ln x of event pixels, [window, unit]."""
         assert self._noise is not None
-        return self._noise.log_signal(flux, self._place(pixel))
+        return self._noise.log_signal(flux, self._place_of[pixel])
 
     def _thresholds(self, pixel: NDArray[np.uint32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         assert self._noise is not None
         shape = self._noise.layout.evs_shape
         maps = self._noise.threshold_on_map, self._noise.threshold_off_map
-        on, off = (np.broadcast_to(theta, shape).ravel()[self._place(pixel)].astype(np.float64) for theta in maps)
+        on, off = (np.broadcast_to(theta, shape).ravel()[self._place_of[pixel]].astype(np.float64) for theta in maps)
         return on, off
-
-    def _place(self, pixel: NDArray[np.uint32]) -> NDArray[np.int64]:
-        """Places of mosaic indices on the event grid."""
-        return self._in_order[np.searchsorted(self._event_pixel, pixel, sorter=self._in_order)]
 
     def _compare(self, units: Units, flux: NDArray[np.float64], reference: NDArray[np.float64]) -> Counted:
         """Compare the events of a flux with those of the reference; both are [window, unit], e⁻/s."""

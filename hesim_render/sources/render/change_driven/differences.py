@@ -134,15 +134,16 @@ def differences(
     steadier = change.controlled_scatter <= change.plain_scatter
     # those windows share rays in the first one, and so the estimator
     steadier[inner] = change.controlled_scatter[inner].sum(axis=0) <= change.plain_scatter[inner].sum(axis=0)
-    for window, controlled in enumerate(steadier):
-        wanted, scatter = difference_of(pilot, window, controlled, sites, units[window], quality, tuning)
+    for window, (controlled, some) in enumerate(zip(steadier, map(np.flatnonzero, rendered), strict=True)):
+        chosen = sites.only(some)
+        wanted, scatter = difference_of(pilot, window, controlled, chosen, units[window], quality, tuning)
         # to the nearest power of two, so that stratified sequences are used whole
         bits = np.rint(np.log2(np.minimum(wanted, tuning.most_rays))).astype(np.int16)
         rays = np.left_shift(np.int16(1), bits)
         # the other window is rendered as well, so that a difference has to be several times cheaper
-        pays = rendered[window] & (np.float32(tuning.difference_gain) * rays <= alone[window])
-        out.rays[window] = np.where(pays, rays, 0)
-        out.controlled[window], out.error[window] = controlled[sites.listed], scatter
+        pays = np.float32(tuning.difference_gain) * rays <= alone[window, some]
+        out.rays[window, some] = np.where(pays, rays, 0)
+        out.controlled[window, some], out.error[window, some] = controlled[chosen.listed], scatter
     for window, refined in enumerate(pilot.refined):
         # a small object passes: many rays look for it
         looked_at = np.zeros(sites.size, np.bool_)
@@ -154,11 +155,13 @@ def differences(
         is_aimed = pilot.aims.at(which, sites.listed[place]).count > 0
         out.rays[which[is_aimed], place[is_aimed]] = 0
     # all windows between take as many rays as the one that needs most, and together pay for those in the first window
-    own = out.rays[inner]
+    some = np.flatnonzero(out.rays[inner].any(axis=0))
+    own = out.rays[inner, some]
     most = own.max(axis=0, initial=0)
     # rays that all inner windows of a pixel save together, [pixel], against `most` rays once more in the first window
-    saved = np.where(own > 0, alone[inner].astype(np.int32) - most, 0).sum(axis=0)
-    own[:] = np.where((own > 0) & (saved > most), most, 0)
+    saved = np.where(own > 0, alone[inner, some].astype(np.int32) - most, 0).sum(axis=0)
+    out.rays[inner, some] = np.where((own > 0) & (saved > most), most, 0)
     # from the scatter of single differences to the error of their mean
-    out.error[:] *= np.float32(tuning.difference_factor) / np.sqrt(np.maximum(out.rays, 1).astype(np.float32))
+    pairs = out.rays > 0
+    out.error[pairs] *= np.float32(tuning.difference_factor) / np.sqrt(out.rays[pairs].astype(np.float32))
     return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,8 +66,10 @@ class Board:
         """Values of the sites [m] in the rectangle, with a margin around; `empty` in all other fields."""
         rows, cols = self.shape
         image = np.full((rows + 2 * margin, cols + 2 * margin), empty, values.dtype)
-        inner = np.full(rows * cols, empty, values.dtype)
-        inner[self.cell] = values
+        inner = values
+        if self.cell.size < rows * cols:
+            inner = np.full(rows * cols, empty, values.dtype)
+            inner[self.cell] = values
         image[margin : margin + rows, margin : margin + cols] = inner.reshape(rows, cols)
         return image
 
@@ -142,14 +144,24 @@ class Sites:
     def size(self) -> int:
         return self.index.size
 
+    def only(self, some: NDArray[np.int64]) -> Sites:
+        """The same sites, with some of the listed pixels as the list."""
+        only = replace(self, listed=self.listed[some], _count=[])
+        if not self.apart:
+            only._count.append(self._counted()[some])
+        return only
+
     def mean(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Mean of `values` [m] over the sites in the 3×3 neighbourhood of each listed pixel, [n]."""
         if self.apart:
             return values[self.listed]
-        # near the rim of the sensor there are fewer than nine
+        return self._sum(values) / self._counted()
+
+    def _counted(self) -> NDArray[np.float32]:
+        """Sites in the 3×3 neighbourhood of each listed pixel, [n]; near the rim of the sensor fewer than nine."""
         if not self._count:
             self._count.append(self._sum(np.ones(self.size, np.float32)))
-        return self._sum(values) / self._count[0]
+        return self._count[0]
 
     def _sum(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         assert self.board is not None

@@ -13,7 +13,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt64
 from hesim_render.core.rng import Stream
-from hesim_render.core.tables import spread_out, table
+from hesim_render.core.tables import spread_out
 from hesim_render.sources.render.change_driven.aim import PairAims, in_blocks
 from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges, joined_rays
 from hesim_render.sources.render.change_driven.packet_tracer import PACKET, PacketTracer, pair_of_rays
@@ -99,7 +99,7 @@ class PairTracer(PacketTracer):
         span_us: tuple[float, float] | None = None,
         aims: PairAims | None = None,
         before: tuple[PilotRays, NDArray[np.integer]] | None = None,
-        kept: NDArray[np.float32] | None = None,
+        kept: Sequence[Float] | None = None,
         repeat: int = 0,
     ) -> PilotFlux:
         """Statistics of a few rays of every listed pair, with random numbers of their own.
@@ -114,8 +114,8 @@ class PairTracer(PacketTracer):
         aims : small objects at which half of the rays of each pair are aimed; each pair has one or more.
         before : rays of other windows, and [n] the place among them of the same rays as those of each pair: the
             statistics then include the differences.
-        kept : [2, n · samples], where the fluxes of single rays are put, by both estimators, e⁻/s on the optical axis.
-            They are large, so the journal keeps nothing of such a pass.
+        kept : [n · samples] each, where the fluxes of single rays are put, by both estimators, e⁻/s on the optical
+            axis. They are large, so the journal keeps nothing of such a pass.
         repeat : number of the set of random numbers.
 
         Returns
@@ -155,12 +155,10 @@ class PairTracer(PacketTracer):
         before: tuple[PilotRays, NDArray[np.integer]] | None = None,
     ) -> tuple[PilotFlux, PilotRays]:
         """As `pilot`, and the fluxes of the single rays, to compare the same rays in other windows with."""
-        kept, used = np.empty((2, pixel.size * samples), np.float32), np.unique(window)
+        kept, used = [dr.empty(jit().Float, pixel.size * samples) for _ in range(2)], np.unique(window)
         out = self.pilot(pixel, window, windows, samples, footprint_px, span_us=span_us, before=before, kept=kept)
-        controlled, plain = (table(jit().Float, values) for values in kept)
-        return out, PilotRays(
-            controlled, plain, samples, (*windows.begin_us[used].tolist(), *windows.end_us[used].tolist())
-        )
+        spans_us = *windows.begin_us[used].tolist(), *windows.end_us[used].tolist()
+        return out, PilotRays(kept[0], kept[1], samples, spans_us)
 
     def edges(
         self,
@@ -291,7 +289,7 @@ class PairTracer(PacketTracer):
         out: PilotFlux,
         part: slice,
         before: tuple[PilotRays, NDArray[np.integer]] | None,
-        kept: NDArray[np.float32] | None,
+        kept: Sequence[Float] | None,
     ) -> None:
         """Statistics of some pairs, each with the same number of rays, and their single rays where they are kept."""
         packets = np.full(lanes[0].size, samples // PACKET)
@@ -300,5 +298,8 @@ class PairTracer(PacketTracer):
         # rays that are aimed are a kind of their own: their mean differs from that of the others
         out.put(part, *traced, samples, samples if aims is None else samples // 2, before)
         if kept is not None:
+            types = jit()
+            place = dr.opaque(types.UInt32, part.start * samples) + dr.arange(types.UInt32, len(traced[0]))
             for values, flux in zip(kept, traced[:2], strict=True):
-                values[part.start * samples : part.stop * samples] = np.array(flux)
+                dr.scatter(values, flux, place)
+            dr.eval(kept)

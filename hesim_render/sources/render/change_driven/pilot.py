@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,12 +121,12 @@ class Pilot:
         """Number of windows."""
         return self.controlled.shape[0]
 
-    def flux_of(self, window: int) -> NDArray[np.float32]:
-        """Flux in one window, by the estimator with less scatter there, [site], e⁻/s."""
-        chosen = self.controlled_scatter[window] <= self.plain_scatter[window]
-        return np.where(chosen, self.controlled[window], self.plain[window])
+    @cached_property
+    def flux(self) -> NDArray[np.float32]:
+        """Flux by the estimator with less scatter in each window, [window, site], e⁻/s."""
+        return np.where(self.controlled_scatter <= self.plain_scatter, self.controlled, self.plain)
 
-    @property
+    @cached_property
     def steady_flux(self) -> NDArray[np.float32]:
         """Flux by the same estimator in all windows, [window, site], e⁻/s, so that every difference is a change of
         the scene.

@@ -150,7 +150,7 @@ def plan(
     count, last = pilot.windows, pilot.windows - 1
     shape = count, sites.listed.size
     # noise units of all sites, [window, site]; the pilot has neighbours besides the listed pixels
-    units = np.stack([unit(pilot.flux_of(window)) for window in range(count)])
+    units = np.stack([unit(flux) for flux in pilot.flux])
     out = Plan(
         np.ones(shape, np.bool_),
         np.zeros(shape, np.int16),
@@ -191,10 +191,10 @@ def plan(
             out.rendered[1:last] |= out.barred[1:last]
             out.asked[:] &= ~out.barred
     # rays, estimator and expected error of every pair; many windows are interpolated from the ends of a block
-    for window in range(count):
+    for window, some in enumerate(map(np.flatnonzero, out.rendered)):
         at_end = is_knot and window in (0, last)
-        part = allocate(pilot, window, sites, units, quality, gain, tuning, at_end)
-        out.rays[window], out.controlled[window], out.error[window], out.floor[window] = part
+        part = allocate(pilot, window, sites.only(some), units, quality, gain, tuning, at_end)
+        out.rays[window, some], out.controlled[window, some], out.error[window, some], out.floor[window, some] = part
     # where little changes, few rays of a difference do what many rays of the pair alone would
     chosen = differences(pilot, sites, units, quality, out.rendered, out.rays, tuning)
     if follows and last > 1:

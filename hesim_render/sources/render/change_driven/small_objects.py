@@ -239,13 +239,21 @@ class Zoom:
         """
         if not self._groups or row.size == 0:
             return []
-        return [self._sites_of(row, col, windows, each) for each in numbers]
-
-    def _sites_of(
-        self, row: NDArray[np.int64], col: NDArray[np.int64], windows: Windows, number: NDArray[np.int64]
-    ) -> list[Look]:
+        # the smallest rectangle around the pixels
         top, left = int(row.min()), int(col.min())
         shape = int(row.max()) - top + 1, int(col.max()) - left + 1
+        return [self._sites_of(row - top, col - left, (top, left), shape, windows, each) for each in numbers]
+
+    def _sites_of(
+        self,
+        row: NDArray[np.int64],
+        col: NDArray[np.int64],
+        corner: tuple[int, int],
+        shape: tuple[int, int],
+        windows: Windows,
+        number: NDArray[np.int64],
+    ) -> list[Look]:
+        """Looks at pixels in their own windows; row and column are counted from a corner of a rectangle."""
         begin, end = windows.begin_us[number], windows.end_us[number]
         # rows of a rolling shutter have different windows; rounded outwards, many of them share one look
         step = np.maximum((end - begin) / _PARTS, 1.0)
@@ -258,9 +266,9 @@ class Zoom:
                 continue
             mine = np.flatnonzero(which == look)
             places = np.full(shape, -1)
-            places[row[mine] - top, col[mine] - left] = mine
+            places[row[mine], col[mine]] = mine
             for outlines, rays, is_small in kinds:
-                chosen.extend(self._looks(outlines, rays, is_small, places, top, left))
+                chosen.extend(self._looks(outlines, rays, is_small, places, *corner))
         return chosen
 
     def _looks(

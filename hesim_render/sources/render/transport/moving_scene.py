@@ -179,7 +179,8 @@ class MovingScene:
 
     def _sort_groups(self) -> None:
         """Sort groups into those tested one by one and those tested in a loop."""
-        simple = [number for number, group in enumerate(self.groups) if group.part.form is not None]
+        forms = {number: group.part.form for number, group in enumerate(self.groups)}
+        simple = [number for number, form in forms.items() if form is not None and not form.sheets]
         together = simple if len(simple) > _FEW else []
         self._single = [number for number in range(len(self.groups)) if number not in together]
         self._described = [self._resting, *(self.groups[number].part for number in self._single)]
@@ -187,8 +188,8 @@ class MovingScene:
         if self.groups:
             self._tracks = Tracks([group.trajectory for group in self.groups])
         if together:
-            forms = [form for k in together if (form := self.groups[k].part.form) is not None]
-            self._fleet = Fleet(self.mi, forms, together, self._tracks, len(self.groups))
+            own = [form for k in together if (form := forms[k]) is not None]
+            self._fleet = Fleet(self.mi, own, together, self._tracks, len(self.groups))
 
     def intersect(self, ray: Ray, moment: Moment, coherent: Mask, active: Mask, flags: MitsubaObject = None) -> Surface:
         """The nearest surface of all parts.

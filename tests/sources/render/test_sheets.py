@@ -1,0 +1,185 @@
+"""Triangles in one plane that are found through a grid, against Mitsuba's own search."""
+
+import numpy as np
+import pytest
+from scipy.spatial import Delaunay
+
+from hesim_render.core.backend import select
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.transport.closed_form import Part, surface_of
+from hesim_render.sources.render.transport.sheets import sheets_of
+
+COUNT = 60_000
+
+pytestmark = pytest.mark.skipif(select().backend == "cuda", reason="a GPU has units for triangles")
+
+
+def mesh(vertices, triangles):
+    mi = mitsuba()
+    made = mi.Mesh("mesh", len(vertices), len(triangles))
+    changed = mi.traverse(made)
+    changed["vertex_positions"] = np.ravel(vertices).astype(np.float32)
+    changed["faces"] = np.ravel(triangles).astype(np.uint32)
+    changed.update()
+    return made
+
+
+def scene_of(*shapes):
+    return mitsuba().load_dict({"type": "scene", **{f"shape_{k}": shape for k, shape in enumerate(shapes)}})
+
+
+def turned(seed):
+    """Axes of a plane, and its normal."""
+    return np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+
+
+def patches(seed=3, size=(0.31, 0.17), axes=None, at=(0.05, -0.04, 0.3)):
+    """Two meshes, each with some triangles of one plane and without others: there are holes. A few are thin."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (260, 2))
+    points[200:] = points[:60] + rng.normal(0, 1e-3, (60, 2))
+    triangles = Delaunay(points).simplices
+    kind = rng.integers(0, 3, len(triangles))
+    axes = turned(seed) if axes is None else axes
+    corners = (points * size) @ axes[:, :2].T + at
+    return [mesh(corners, triangles[kind == number]) for number in range(2)]
+
+
+def rays(towards=0.25, seed=1):
+    mi, rng = mitsuba(), np.random.default_rng(seed)
+    origin = rng.normal(size=(3, COUNT)) * rng.choice([0.2, 1.0], COUNT)
+    direction = rng.normal(size=(3, COUNT)) * towards + np.array([[0.05], [-0.04], [0.3]]) - origin
+    direction /= np.linalg.norm(direction, axis=0)
+    ray = mi.Ray3f(mi.Point3f(origin.astype(np.float32)), mi.Vector3f(direction.astype(np.float32)))
+    ray.maxt = mi.Float(rng.choice([np.inf, 0.7], COUNT).astype(np.float32))
+    return ray
+
+
+def wall(axes, at):
+    """A rectangle of two triangles in another plane."""
+    corners = np.array([[-0.6, -0.7], [0.8, -0.7], [0.8, 0.5], [-0.6, 0.5]]) @ axes[:, :2].T + at
+    return mesh(corners, [[0, 1, 2], [0, 2, 3]])
+
+
+SCENES = {
+    "one plane": lambda: patches(),
+    "a wall behind": lambda: [*patches(), wall(turned(3), np.array([0.05, -0.04, 0.3]) - 0.07 * turned(3)[:, 2])],
+    "two that cross": lambda: [*patches(), *patches(5)],
+    # as of a target that is read from a file: two decals 20 µm above one another
+    "almost one plane": lambda: [
+        *patches(axes=np.eye(3)),
+        *patches(6, (0.21, 0.09), np.eye(3), (0.02, -0.03, 0.30002)),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_hits_are_those_of_mitsuba(name):
+    import drjit as dr
+
+    mi = mitsuba()
+    scene = scene_of(*SCENES[name]())
+    part = Part(mi, scene, apart=False)
+    ray, everywhere = rays(), mi.Bool(True)
+    assert part._scene is None
+    theirs = scene.ray_intersect(ray)
+    hit, face = part.nearest(ray, False, everywhere)
+    ours = surface_of([part], hit, face, ray, mi.RayFlags.All, everywhere)
+
+    met, wanted = np.array(hit.is_valid()), np.array(theirs.is_valid())
+    assert 0.05 < wanted.mean() < 0.9
+    # a ray that grazes an edge may fall to the other side by rounding
+    assert np.mean(met == wanted) > 0.9998
+    assert np.all(np.isinf(np.array(hit.t)[~met]))
+    both = met & wanted
+    off = np.full(COUNT, np.inf)
+    off[both] = np.abs(np.array(hit.t)[both] - np.array(theirs.t)[both])
+    assert np.mean(off[both] < 3e-6) > 0.9998
+    for field in ("shape", "prim_index"):
+        told, known = getattr(ours, field), getattr(theirs, field)
+        if field == "shape":
+            told, known = (dr.reinterpret_array(mi.UInt32, pointer) for pointer in (told, known))
+        assert np.mean(np.array(told)[both] == np.array(known)[both]) > 0.9995, field
+    same = both & (np.array(ours.prim_index) == np.array(theirs.prim_index)) & (off < 3e-6)
+    for field, told, known in [("p", ours.p, theirs.p), ("n", ours.n, theirs.n), ("wi", ours.wi, theirs.wi)]:
+        assert np.mean(np.abs(np.array(told) - np.array(known))[:, same].max(axis=0) < 2e-5) > 0.999, field
+
+    blocked = np.array(part.blocks(ray, everywhere))
+    np.testing.assert_array_equal(blocked, met)
+    asked = mi.Bool(np.arange(COUNT) % 3 == 0)
+    hit, _ = part.nearest(ray, False, asked)
+    for some in (hit.is_valid(), part.blocks(ray, asked)):
+        np.testing.assert_array_equal(np.array(some), met & np.array(asked))
+
+
+def test_there_is_no_gap_between_two_triangles_and_nothing_beyond_the_rim():
+    """Rays through all sides and corners of a fan of thin triangles, as in the middle of a Siemens star."""
+    mi, rng = mitsuba(), np.random.default_rng(8)
+    angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    rim = np.stack([0.13 * np.cos(angle), 0.13 * np.sin(angle)], axis=1)
+    axes, at = turned(11), np.array([0.4, -1.3, 0.2])
+    points = np.concatenate([[[0, 0]], rim])
+    each = np.arange(400)
+    triangles = np.stack([np.zeros(400, int), each + 1, (each + 1) % 400 + 1], axis=1)
+    corners = points @ axes[:, :2].T + at
+    part = Part(mi, scene_of(mesh(corners, triangles[::2]), mesh(corners, triangles[1::2])), apart=False)
+    assert part._scene is None
+
+    def met(place):
+        target = place @ axes[:, :2].T + at
+        origin = at + 0.9 * axes[:, 2] + rng.normal(0, 0.1, (*place.shape[:1], 3))
+        direction = target - origin
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        ray = mi.Ray3f(mi.Point3f(origin.T.astype(np.float32)), mi.Vector3f(direction.T.astype(np.float32)))
+        return np.array(part.nearest(ray, False, mi.Bool(True))[0].is_valid())
+
+    on_sides = rim[rng.integers(0, 400, 40_000)] * rng.uniform(0, 0.999, (40_000, 1))
+    assert met(on_sides).all()
+    middle = 0.5 * (rim + np.roll(rim, -1, axis=0))
+    assert met(middle * (1 - 2e-5)).all()
+    assert not met(middle * (1 + 2e-5)).any()
+
+
+def test_a_ray_leaves_the_sheet_it_starts_from():
+    mi, rng = mitsuba(), np.random.default_rng(4)
+    part = Part(mi, scene_of(*patches()), apart=False)
+    ray = rays(0.1)
+    hit, face = part.nearest(ray, False, mi.Bool(True))
+    si = surface_of([part], hit, face, ray, mi.RayFlags.All, mi.Bool(True))
+    direction = rng.normal(size=(3, COUNT))
+    direction /= np.linalg.norm(direction, axis=0)
+    onwards = si.spawn_ray(mi.Vector3f(direction.astype(np.float32)))
+    start = np.array(hit.is_valid())
+    assert start.any()
+    assert not np.array(part.blocks(onwards, mi.Bool(True)))[start].any()
+
+
+def lifted(height, seed=3):
+    """The same plane, with one corner lifted by some of its size."""
+    rng = np.random.default_rng(seed)
+    points = np.concatenate([rng.uniform(-1, 1, (40, 2)), np.zeros((40, 1))], axis=1)
+    points[7, 2] = height
+    return [mesh(points, Delaunay(points[:, :2]).simplices)]
+
+
+def test_planes_are_told_apart():
+    assert [len(sheet.corners) for sheet in sheets_of(patches())] == [sum(one.face_count() for one in patches())]
+    assert len(sheets_of(lifted(0))) == 1
+    assert sheets_of(lifted(1e-4)) == []
+    sizes = [len(sheet.corners) for sheet in sheets_of(SCENES["almost one plane"]())]
+    assert sizes == [sum(m.face_count() for m in patches()), sum(m.face_count() for m in patches(6))]
+    three = [wall(np.eye(3), (0, 0, 0.1 * k)) for k in range(4)]
+    assert len(sheets_of(three[:3])) == 3
+    assert sheets_of(three) == []
+    # a triangle without an area belongs to no plane, nor one that is smaller than what its corners are rounded by
+    corners = np.array([[0, 0, 5], [1, 0, 5], [0, 1, 5], [0, 0, 2], [0, 0, 3], [0, 0, 1], [1e-6, 0, 1], [0, 1e-6, 1]])
+    (sheet,) = sheets_of([mesh(corners, [[0, 1, 2], [3, 4, 5], [5, 6, 7]])])
+    assert sheet.owner.tolist() == [[0, 0]]
+
+
+def test_what_is_in_no_plane_is_left_to_mitsuba():
+    mi = mitsuba()
+    for shapes in (lifted(0.1), [*patches(), {"type": "sphere", "radius": 0.1}], [*patches(), {"type": "disk"}]):
+        part = Part(mi, scene_of(*shapes), apart=False)
+        assert part.form is None
+        assert not part._sheets
