@@ -131,13 +131,33 @@ def test_there_is_no_gap_between_two_triangles_and_nothing_beyond_the_rim():
         direction = target - origin
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         ray = mi.Ray3f(mi.Point3f(origin.T.astype(np.float32)), mi.Vector3f(direction.T.astype(np.float32)))
-        return np.array(part.nearest(ray, False, mi.Bool(True))[0].is_valid())
+        found = np.array(part.nearest(ray, False, mi.Bool(True))[0].is_valid())
+        np.testing.assert_array_equal(np.array(part.blocks(ray, mi.Bool(True))), found)
+        return found
 
     on_sides = rim[rng.integers(0, 400, 40_000)] * rng.uniform(0, 0.999, (40_000, 1))
     assert met(on_sides).all()
     middle = 0.5 * (rim + np.roll(rim, -1, axis=0))
     assert met(middle * (1 - 2e-5)).all()
     assert not met(middle * (1 + 2e-5)).any()
+
+
+def test_the_rim_belongs_to_the_sheet():
+    """Straight rays at a square of 5 by 5 smaller ones, on its corners and sides, in numbers that nothing rounds."""
+    mi = mitsuba()
+    at = np.arange(6) * 0.125 - 0.25
+    points = np.array([[x, y, -0.5] for y in at for x in at])
+    first = np.array([6 * row + col for row in range(5) for col in range(5)])[:, None]
+    part = Part(
+        mi, scene_of(mesh(points, np.concatenate([np.add(first, [0, 1, 6]), np.add(first, [7, 6, 1])]))), apart=False
+    )
+    assert part._sheets
+    rim = points[(np.abs(points[:, :2] - 0.0625) > 0.3).any(axis=1)]
+    assert len(rim) == 20
+    ray = mi.Ray3f(mi.Point3f(np.add(rim, [0, 0, 0.75]).T.astype(np.float32)), mi.Vector3f(0, 0, -1))
+    hit, _ = part.nearest(ray, False, mi.Bool(True))
+    assert np.array(hit.t).tolist() == [0.75] * 20
+    assert np.array(part.blocks(ray, mi.Bool(True))).all()
 
 
 def test_a_ray_leaves_the_sheet_it_starts_from():
