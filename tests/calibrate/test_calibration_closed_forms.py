@@ -822,13 +822,15 @@ def test_without_maps_of_frames_there_is_no_signal_at_event_pixels(tmp_path, mon
 @pytest.mark.parametrize("part", [8, 12, 40])
 def test_parts_of_a_dark_capture_are_eight_or_more_and_add_up(part):
     rng = np.random.default_rng(1)
-    parts = rng.integers(0, 5, (part, 3, 4))
+    parts = rng.integers(0, 5, (part, 7, 4))
+    moved = parts.copy()
+    moved[:2, 0, 0] += [-10, 10]
     on = parts.sum(axis=0) // 3
     maps = {"dark_n_on": on, "dark_n_off": parts.sum(axis=0) - on}
     assert counts._parts({"dark_parts": parts}, maps, 120, "a.npz") is parts
     for wrong, trials, words in (
         (parts[:7], 70, "holds 7 parts"), (parts, 119, "a divisor of n_trials"), (parts[:, :2], 120, "whole numbers"),
-        (parts + 1, 120, "does not add up"), (parts * 1.0, 120, "whole numbers"),
+        (parts + 1, 120, "does not add up"), (moved, 120, "does not add up"), (parts * 1.0, 120, "whole numbers"),
     ):  # fmt: skip
         with pytest.raises(SpecError, match=words):
             counts._parts({"dark_parts": wrong}, maps, trials, "a.npz")

@@ -338,6 +338,24 @@ def test_each_polarity_of_a_trial_has_its_own_threshold_leak_and_grid(monkeypatc
     for k, polarity in enumerate((1, -1)):
         likelihood.chances(values, trials, polarity, grids[k], "sqrt")
     assert seen == [(grids[0].tolist(), 0.31, (0.04, 0.0)), (grids[1].tolist(), 0.2, (0.0, 0.04))]
+    # step and noise by their definitions, and chances among the trials that the other polarity has not ended
+    rng, law = np.random.default_rng(2), {"linear": 2, "sqrt": 1}
+    own, other, given = rng.uniform(0, 0.2, (2, 2, 3)), rng.uniform(0, 0.3, (2, 2, 3)), []
+    monkeypatch.setattr(likelihood, "first_event", lambda *some: given.append(some) or (own, other))
+    values[likelihood.RESPONSE], values[likelihood.SHOT], values[likelihood.DARK] = 0.07, 0.003, 0.0021
+    trials.edges_s = np.array([0.0, 0.1, 0.3])
+    after = trials.signal_dn * np.exp(trials.contrast)
+    for name, power in law.items():
+        for k, polarity in enumerate((1, -1)):
+            chance = likelihood.chances(values, trials, polarity, grids[k], name)
+            np.testing.assert_allclose(chance, np.moveaxis(own / (1 - other[0] - other[1]), 0, 1))
+            _, _, step, noise, *_ = given.pop()
+            np.testing.assert_allclose(
+                step[:, 0], polarity * np.log((1 + 0.07 * after) / (1 + 0.07 * trials.signal_dn))
+            )
+            for sigma, light in zip(noise, (trials.signal_dn, after), strict=True):
+                variance = (0.003 * light**power + 0.0021) / (1 + 0.07 * light) ** 2
+                np.testing.assert_allclose(sigma[:, 0] ** 2, variance + (1e-3 * 0.2) ** 2)
     weight = np.array([[0.2, 0.5, 0.3], [0.0, 0.9, 0.1]])
     monkeypatch.setattr(trials_analysis, "TrialCounts", SimpleNamespace(of=lambda sets, polarity: polarity))
     some = SimpleNamespace(calm=np.zeros((2, 2)), of=lambda which: which)

@@ -14,6 +14,7 @@ from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal
 from hesim_render.calibrate.asynchronous import likelihood
 from hesim_render.calibrate.asynchronous import output as trials_output
+from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.calibration import sensor_values
 from hesim_render.core.errors import SpecError
 
@@ -355,6 +356,57 @@ def test_beta_and_noise_of_trials_have_errors_of_the_delta_method(law, power):
     fit.free = np.isin(np.arange(len(names)), (of.SHOT, 0))
     assert of._noise(fit, light)["standard_error"] == pytest.approx(sizes[of.SHOT] * slope[of.SHOT], rel=1e-3)
     assert of._beta(fit)[0][4] == 0.0 and of._beta(fit)[1][4] is None
+
+
+def test_figures_of_trials_are_sums_over_pixels_beside_the_mean_chance(monkeypatch):
+    """Three kinds of steps, two up and one down, with two time bins; chances differ by kind, bin and threshold."""
+    rng, sizes = np.random.default_rng(9), (3, 2, 5)
+    steps = Trials(
+        np.array([40.0, 70.0, 40.0]), np.array([0.3, 0.2, -0.4]), 1e-3, np.array([0.0, 2e-3, 7e-3]),
+        rng.integers(60, 90, (3, 5)), rng.integers(0, 9, sizes), rng.integers(0, 9, sizes), (1, 5),
+    )  # fmt: skip
+    steady = Trials(
+        np.array([11.0, 80.0]), np.zeros(2), 1e-3, np.array([0.0, 0.013]), rng.integers(60, 90, (2, 5)),
+        rng.integers(0, 9, (2, 1, 5)), rng.integers(0, 9, (2, 1, 5)), (1, 5),
+    )  # fmt: skip
+    laws = {1: np.array([0.2, 0.5, 0.3]), -1: np.array([0.1, 0.2, 0.7])}
+
+    def chance(signal, contrast, bin_, polarity, threshold):
+        return 1e-3 * (signal + 20 * abs(contrast)) * (1 + 2 * bin_) * threshold * (1.5 if polarity < 0 else 1)
+
+    def chances(values, there, polarity, grid, law):
+        assert (values, law) == ("values", "sqrt")
+        bins = range(there.edges_s.size - 1)
+        return np.array([[[chance(s, c, j, polarity, v) for v in grid] for j in bins]
+                         for s, c in zip(there.signal_dn, there.contrast, strict=True)])  # fmt: skip
+
+    monkeypatch.setattr(trials_output, "chances", chances)
+    monkeypatch.setattr(trials_output, "step_of", lambda values, there: 0.9 * there.contrast)
+    grids = np.array([1.0, 2.0, 4.0]), np.array([1.5, 2.5, 3.0])
+    fit = SimpleNamespace(
+        values="values", law="sqrt", likelihood=SimpleNamespace(grids=grids),
+        law_of_thresholds=lambda k: laws[1 - 2 * k],
+    )  # fmt: skip
+    figures = trials_output._figures(fit, steady, steps)
+    wanted = []
+    for polarity, kinds, grid in ((1, (0, 1), grids[0]), (-1, (2,), grids[1])):
+        for j in range(2):
+            for kind in kinds:
+                signal, contrast = steps.signal_dn[kind], steps.contrast[kind]
+                events = (steps.on if polarity > 0 else steps.off)[kind, : j + 1].sum()
+                mean = sum(
+                    w * chance(signal, contrast, b, polarity, v)
+                    for b in range(j + 1)
+                    for v, w in zip(grid, laws[polarity], strict=True)
+                )
+                wanted.append([polarity, signal, 0.9 * contrast, j, events, steps.calm[kind].sum(), mean])
+    np.testing.assert_allclose(figures["figure_s_curves"], wanted)
+    rates = [
+        [signal, steady.on[k].sum(), steady.off[k].sum(), steady.calm[k].sum() * 0.013,
+         *(chance(signal, 0, 0, p, grid) @ laws[p] / 0.013 for p, grid in zip((1, -1), grids, strict=True))]
+        for k, signal in enumerate(steady.signal_dn)
+    ]  # fmt: skip
+    np.testing.assert_allclose(figures["figure_noise_rate"], rates)
 
 
 ENTRY = SimpleNamespace(error=SpecError)
