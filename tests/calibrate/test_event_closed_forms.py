@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.special import ndtr
-from scipy.stats import norm
+from scipy.stats import multivariate_normal, norm
 
 from hesim_render.calibrate.asynchronous import analysis as trials_analysis
 from hesim_render.calibrate.asynchronous import fit as trials_fit
@@ -368,3 +368,21 @@ def test_each_polarity_of_a_trial_has_its_own_threshold_leak_and_grid(monkeypatc
         np.testing.assert_allclose(mean, weight[::polarity] @ relative, rtol=1e-6)
         wanted = np.sqrt(weight[::polarity] @ relative**2 - (weight[::polarity] @ relative) ** 2)
         np.testing.assert_allclose(spread, wanted, rtol=1e-4)
+
+
+def test_noise_passes_a_level_at_the_rate_of_its_crossings_and_their_clumps():
+    """Rice's rate at two equal poles times κ, ln κ a polynomial from −1.5 to 6, a line below, even above."""
+    h = np.array([-4.0, -2.0, -1.0, 0.0, 0.7, 2.5, 4.5, 6.0, 7.5])
+    inside = np.clip(h, -1.5, 6.0)
+    kappa = sum(factor * inside ** (7 - k) for k, factor in enumerate(likelihood._LOG_KAPPA))
+    kappa += -2.112 * np.minimum(h + 1.5, 0)
+    crossings = np.exp(-(h**2) / 2) / np.sqrt(np.sqrt(2) - 1)
+    np.testing.assert_allclose(likelihood.passage_rate(h), crossings * np.exp(kappa), rtol=1e-9)
+    # of lines between nodes 1/16 of a period apart, far up: the chance of being below at one and above at the next.
+    # The variance of a line is (2 + ρ)/3 of that of its nodes on the average
+    step = 2 * np.pi / 16 / np.sqrt(np.sqrt(2) - 1)
+    rho = (1 + step) * np.exp(-step)
+    for level in (4.0, 5.0):
+        node = level * np.sqrt((2 + rho) / 3)
+        both = multivariate_normal.cdf([-node, -node], cov=[[1, rho], [rho, 1]])
+        assert likelihood.passage_rate(np.array(level)) == pytest.approx(16 * (norm.sf(node) - both), rel=0.02)

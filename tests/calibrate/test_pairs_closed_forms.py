@@ -132,6 +132,8 @@ def test_a_long_series_is_read_as_a_stack_of_one_exposure():
 def test_the_signal_at_saturation_is_that_of_its_level_or_the_last(saturation, top):
     result = SimpleNamespace(signal=np.array([7.0, 20.0, 45.0]), saturation=saturation)
     assert pairs.PairCalibration.top_dn.fget(result) == top
+    result.lit, result.black = SimpleNamespace(mean=np.array([30.0, 71.0, 64.0])), SimpleNamespace(value=9.5)
+    assert pairs.PairCalibration.brightest_dn.fget(result) == 61.5
 
 
 def test_statistics_of_a_pair_are_those_of_its_definition():

@@ -7,11 +7,12 @@ import pytest
 from scipy import stats
 
 from hesim_render.calibrate.estimate import estimated
-from hesim_render.calibrate.recordings import short_intervals, still, target
+from hesim_render.calibrate.recordings import calibration, short_intervals, still, target
 from hesim_render.calibrate.recordings import tally as recording_tally
 from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import readout_limit
 from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, SLICES, EventTally, tally
+from hesim_render.core.errors import RangeError
 from hesim_render.exchange import EventStream
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
@@ -517,3 +518,28 @@ def test_a_rate_that_doubles_is_unsteady_beyond_four_errors_of_counting(events, 
         assert f"from {early:.4g} to {late:.4g} Hz a pixel, at most {rate.max():.4g}" in found
     tally.slices[:] = events / 2
     assert still.unsteady(tally) is None
+
+
+@pytest.mark.parametrize(("contrast", "cycles_hz", "is_right"), [
+    (1.001, 0.01, True), (1.0, 3.0, False), (9999.0, None, True), (1e4, None, False), (2.0, 0.0, False),
+    (2.0, -3.0, False), (None, 3.0, False),
+])  # fmt: skip
+def test_a_target_has_a_contrast_above_one_and_cycles(contrast, cycles_hz, is_right):
+    if is_right:
+        calibration._check_target(True, contrast, cycles_hz)
+    else:
+        with pytest.raises(RangeError, match="target_"):
+            calibration._check_target(contrast is not None, contrast, cycles_hz)
+
+
+def test_files_are_read_in_equal_parts_of_the_progress(monkeypatch):
+    parts = []
+    monkeypatch.setattr(calibration, "open_events", lambda name, **_: SimpleNamespace(shape=(3, 4), name=name))
+    monkeypatch.setattr(calibration, "tally", lambda stream: SimpleNamespace(shape=(3, 4), name=stream.name))
+    monkeypatch.setattr(
+        calibration, "figures", lambda tallies, moving, *given: ([t.name for t in tallies], moving.name)
+    )
+    found = calibration.calibrate_recordings(
+        ["a", "b"], lux=[3.0, 8.0], target_file="c", target_contrast=4.0, progress=lambda what, part: parts.append(part)
+    )
+    assert found == (["a", "b"], "c") and parts == pytest.approx([0, 0.25, 0.5, 0.75])

@@ -629,7 +629,9 @@ def with_one(place, value):
     [
         ({}, None),
         ({"contrast": with_one(0, 20.01)}, "within ±20"), ({"contrast": with_one(1, -20.01)}, "within ±20"),
-        ({"contrast": with_one(1, 0.0)}, "steps up"), ({"signal_dn": with_one(0, 0.0)}, "a step needs light"),
+        ({"contrast": with_one(1, 0.0)}, "steps up"), ({"contrast": with_one(0, -19.0)}, "steps up"),
+        ({"contrast": with_one(1, 19.0)}, "steps up"), ({"n_off": with_one((0, 1, 1, 0), -1)}, "below 0"),
+        ({"signal_dn": with_one(0, 0.0)}, "a step needs light"),
         ({"n_on": with_one((0, 0, 0, 0), 1)}, "more trials together"),
         ({"n_calm": with_one((1, 0, 2), 2)}, "more trials together"),
         ({"n_calm": with_one((1, 1, 0), 21)}, "fifth"), ({"edges_us": with_one(0, 1)}, "begin with 0"),
@@ -643,6 +645,7 @@ def test_trials_that_are_just_right_and_just_wrong(changes, words, tmp_path):
         found = trials_module._read(file, has_steps=True)
         assert found.settle_s == pytest.approx(9e-4) and found.shape == (2, 3)
         np.testing.assert_allclose(found.edges_s, [0, 4e-5, 1.1e-4])
+        assert found.calm.shape == (2, 6) and found.on.shape == found.off.shape == (2, 2, 6)
         for name, values in (("n_calm", found.calm), ("n_on", found.on), ("n_off", found.off)):
             np.testing.assert_array_equal(values.reshape(arrays_of()[name].shape), arrays_of()[name])
     else:
