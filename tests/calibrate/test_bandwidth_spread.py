@@ -135,6 +135,8 @@ def test_of_several_recordings_the_surest_counts():
     found = surest(given)
     assert found["bandwidth_rel"] is narrow and found["odd_cols_rel"] is limit
     assert surest([given[0], given[0]])["bandwidth_rel"] is reason
+    narrow, low = ({key: {"interval_95": interval} for key in KEYS} for interval in ([0.5, 0.6], [0.1, 0.4]))
+    assert surest([low, narrow]) == surest([narrow, low]) == narrow
 
 
 def test_random_events_without_noise_of_a_level_have_no_spread_beyond_their_limit():

@@ -622,7 +622,7 @@ def test_the_width_of_s_curves_is_compared_with_the_noise_of_the_static_counts(c
     covariance[1, 1] = 0.09**2
     error = np.sqrt((0.0011 / measured) ** 2 + 0.01**2 + 0.02**2)
 
-    def told(share):
+    def told(share, measured=measured, given=given):
         """What is found where Θ is such that the static counts ask for a share of the measured noise."""
         fit = SimpleNamespace(
             values=natural_values, parameters=from_natural(natural_values), covariance=covariance, law=law,
@@ -637,6 +637,10 @@ def test_the_width_of_s_curves_is_compared_with_the_noise_of_the_static_counts(c
     assert told(1.02) is None
     for share in (0.86, 1.17):
         assert told(share).p_value == pytest.approx(2 * ndtr(-abs(np.log(share)) / error), rel=1e-6)
+    # noise that is not known to a quarter tells nothing, and a mismatch beyond the width is not taken from it
+    for part, is_told in ((0.245, True), (0.255, False)):
+        assert (told(0.2, given=replace(given, noise=(0.062, part * measured))) is not None) == is_told
+    assert told(0.8, 0.062, replace(given, width=0.0305)) is not None
 
 
 def test_noise_of_the_frames_makes_no_edge_of_an_even_scene():
@@ -690,6 +694,20 @@ def test_floors_and_ceiling_of_exact_curves_are_found():
     found = curve_levels(steps, SimpleNamespace(values=values * [1.02, 0.98, 1.05, 1.0], step=step))
     for (value, error), true in zip((found.floor_on, found.floor_off, found.ceiling), (*floors, ceiling), strict=True):
         assert value == pytest.approx(true, abs=1e-6) and error < 1e-6
+
+
+def test_errors_of_floors_and_ceiling_are_those_of_leaving_groups_out(monkeypatch):
+    """Of the groups that have pixels."""
+    pixels = np.where(np.arange(GROUPS) == 3, 0.0, 40.0)
+    own = np.random.default_rng(2).normal(size=(GROUPS, 7))
+    monkeypatch.setattr(event_checks, "_fit", lambda steps, step, groups, start: own[groups].sum(axis=0))
+    given = SimpleNamespace(values=np.ones(4), step=None)
+    found = curve_levels(SimpleNamespace(pixels=pixels), given)
+    for k, (value, error) in zip((4, 5, 6), (found.floor_on, found.floor_off, found.ceiling), strict=True):
+        without = own[:, k].sum() - own[pixels > 0, k]
+        assert value == pytest.approx(own[:, k].sum())
+        count = GROUPS - 1
+        assert error == pytest.approx(np.sqrt((count - 1) / count * np.sum((without - without.mean()) ** 2)))
 
 
 def test_noise_of_two_equal_poles_has_its_correlation():

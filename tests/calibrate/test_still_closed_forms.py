@@ -11,7 +11,7 @@ from hesim_render.calibrate.recordings import calibration, short_intervals, stil
 from hesim_render.calibrate.recordings import tally as recording_tally
 from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import readout_limit
-from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, SLICES, EventTally, tally
+from hesim_render.calibrate.recordings.tally import GROUPS, LAMPS_HZ, LONG_US, SLICES, EventTally, tally
 from hesim_render.core.errors import RangeError
 from hesim_render.exchange import EventStream
 from hesim_render.pixels.evs.events import EVENT_DTYPE
@@ -518,6 +518,37 @@ def test_a_rate_that_doubles_is_unsteady_beyond_four_errors_of_counting(events, 
         assert f"from {early:.4g} to {late:.4g} Hz a pixel, at most {rate.max():.4g}" in found
     tally.slices[:] = events / 2
     assert still.unsteady(tally) is None
+
+
+def test_the_error_of_a_leak_without_a_ratio_has_the_scatter_of_the_difference():
+    """ON and OFF scatter together, by 3 % and 1 % of ON; OFF events are a thousandth of ON."""
+    rates = np.tile(np.array([[10.0], [0.01]]), GROUPS + 1)
+    rates[:, 1:] += np.array([[3.0], [1.0]]) * np.linspace(-0.1, 0.1, GROUPS)
+    scatter = np.sqrt(19 / 20 * np.sum((2 * np.linspace(-0.1, 0.1, GROUPS)) ** 2))
+    told = still._leak_alone(rates, "why")
+    assert told["standard_error"] == pytest.approx(np.hypot(scatter, 0.75 * 0.01))
+
+
+@pytest.mark.parametrize(("count", "of"), [(7, 23), (0, 40), (31, 31)])
+def test_a_share_has_the_interval_of_a_binomial_count(count, of):
+    told = still.share(count, of)
+    interval = stats.binomtest(count, of).proportion_ci(method="exact")
+    assert told["value"] == count / of and told["interval_95"] == pytest.approx([interval.low, interval.high])
+    assert told["standard_error"] == pytest.approx(stats.binom.std(of, count / of) / of)
+
+
+@pytest.mark.parametrize("periods", [1.95, 2.05])
+def test_a_lamp_is_told_from_slices_of_two_of_its_periods(periods):
+    """All ON events at one phase of the slower lamp."""
+    seconds = periods * SLICES / min(LAMPS_HZ)
+    slices = np.zeros((2, SLICES, GROUPS), int)
+    slices[0] = 50
+    on = slices[0].sum(axis=1)
+    waves = on * np.exp(0.4j) * np.array([[lamp == min(LAMPS_HZ)] for lamp in LAMPS_HZ])
+    told = still.of_a_lamp(SimpleNamespace(slices=slices, seconds=seconds, waves=waves))
+    assert (told is not None) == (periods > 2)
+    if told is not None:
+        assert f"a lamp of {min(LAMPS_HZ):g} Hz" in told
 
 
 @pytest.mark.parametrize(("contrast", "cycles_hz", "is_right"), [
