@@ -218,11 +218,11 @@ def test_pooled_s_curves_have_the_moments_of_their_law():
     steps = SimpleNamespace(**{**vars(steps), "events": lambda polarity: both[polarity]})
     for s in (1, -1):
         np.testing.assert_allclose(trials_fit.pixel_thresholds(steps, s), centre[s], atol=2e-3)
-    # of several lights the brightest of that polarity, whatever those of the other are
-    lights = {1: 70.0, -1: 41.0}
+    # of several lights the brightest of that polarity, to a thousandth, whatever those of the other are
+    bright = np.where(sign > 0, 70.0, 41.0) * np.where(np.abs(contrast) < 0.3, 0.9996, 1)
     more = [size[:3] * s for s in (1, -1)]
     unlike = SimpleNamespace(
-        signal_dn=np.concatenate([[lights[s] for s in sign], [31.0] * 3, [17.0] * 3]),
+        signal_dn=np.concatenate([bright, [31.0] * 3, [17.0] * 3]),
         contrast=np.concatenate([contrast, *more]), calm=np.concatenate([calm, calm[:6]]),
         events=lambda polarity: np.concatenate([both[polarity], np.zeros((6, 2, 3))]),
     )  # fmt: skip

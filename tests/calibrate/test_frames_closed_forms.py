@@ -438,22 +438,24 @@ def test_values_between_two_levels_belong_to_both_by_their_chance():
 def test_a_chain_has_the_share_and_the_correlation_of_its_states(monkeypatch):
     """P(high, high) = p² + p (1 − p) c; the search ends where the likelihood rises no more, or after its rounds."""
     rng, rounds = np.random.default_rng(2), []
-    y, high = rng.normal(40, 3, (2, 6, 2)), rng.uniform(0.1, 0.6, (2, 6, 2))
+    y, high = rng.normal(40, 3, (2, 6, 3)), rng.uniform(0.1, 0.6, (2, 6, 3))
+    high[..., 2] = 1.0  # never low: share and correlation stay 1e-4 below 1
     share = high.mean(axis=(0, 1))
-    both = share**2 + share * (1 - share) * np.array([0.37, 0.81])
+    both = share**2 + share * (1 - share) * np.array([0.37, 0.81, 0.0])
+    share[2], stay = 0.9999, [0.37, 0.81, 0.9999]
 
     def chain(y, t, level, width, share, correlation):
         rounds.append((share, correlation))
-        return np.full(2, [-50.0, -40.0, -40.0][len(rounds) - 1]), high, both
+        return np.full(3, [-50.0, -40.0, -40.0][len(rounds) - 1]), high, both
 
     monkeypatch.setattr(telegraph, "_chain", chain)
     found = telegraph._climb(y, np.array([0.4, 1.0])[:, None, None], y > 40)
     assert len(rounds) == 3
     np.testing.assert_allclose(rounds[0], 0.5)
     for one in (rounds[1], rounds[2], found[2:4]):
-        np.testing.assert_allclose(one, [share, [0.37, 0.81]])
+        np.testing.assert_allclose(one, [share, stay])
     np.testing.assert_allclose(found[0], telegraph._line(y, np.broadcast_to([[[0.4]], [[1.0]]], y.shape), high)[0])
-    assert found[4].tolist() == [-40, -40]
+    assert found[4].tolist() == [-40, -40, -40]
 
 
 def test_the_likelier_of_two_fits_counts_and_its_higher_level(monkeypatch):
