@@ -386,3 +386,30 @@ def test_noise_passes_a_level_at_the_rate_of_its_crossings_and_their_clumps():
         node = level * np.sqrt((2 + rho) / 3)
         both = multivariate_normal.cdf([-node, -node], cov=[[1, rho], [rho, 1]])
         assert likelihood.passage_rate(np.array(level)) == pytest.approx(16 * (norm.sf(node) - both), rel=0.02)
+
+
+def test_counts_of_trials_have_the_likelihood_of_their_outcomes(monkeypatch):
+    """Each event has the chance of its kind and bin, each silent trial that of none; a posterior adds up to 1."""
+    rng, grid = np.random.default_rng(4), np.array([0.15, 0.2, 0.25, 0.3])
+    tables = {"a": rng.uniform(0.05, 0.3, (2, 3, 4)), "b": rng.uniform(0.05, 0.4, (1, 2, 4))}
+    monkeypatch.setattr(likelihood, "chances", lambda values, trials, polarity, grid, law: tables[trials])
+    events, silent = rng.integers(0, 9, (5, 8)).astype(float), rng.integers(0, 40, (5, 3)).astype(float)
+    counts = likelihood.TrialCounts(-1, ["a", "b"], events, silent)
+    found = counts.log_likelihood(None, grid, "sqrt")
+    wanted = np.zeros((5, 4))
+    for pixel in range(5):
+        column = 0
+        for number, chance in enumerate([*tables["a"], *tables["b"]]):
+            for of_bin in chance:
+                wanted[pixel] += events[pixel, column] * np.log(of_bin)
+                column += 1
+            wanted[pixel] += silent[pixel, number] * np.log(1 - chance.sum(axis=0))
+    np.testing.assert_allclose(found, wanted)
+    values = np.full(9, 0.4)
+    values[likelihood.THETA[1]], values[likelihood.MISMATCH[1]] = 0.22, 0.17
+    spread = np.hypot(0.17, 0.05 / 0.22)  # no narrower than a step of the grid
+    prior = np.exp(-0.5 * ((grid / 0.22 - 1) / spread) ** 2)
+    fit = trials_fit.Fit("sqrt", values, None, None, None, SimpleNamespace(grids=(None, grid)), 0.0)
+    posterior = np.exp(wanted - wanted.max(axis=1, keepdims=True)) * prior
+    np.testing.assert_allclose(fit.law_given(counts), posterior / posterior.sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(fit.law_of_thresholds(1), prior / prior.sum())

@@ -16,6 +16,7 @@ from hesim_render.calibrate.asynchronous import likelihood
 from hesim_render.calibrate.asynchronous import output as trials_output
 from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.calibration import sensor_values
+from hesim_render.calibration.spec import Defect
 from hesim_render.core.errors import SpecError
 
 #: Half of an interval of 95 % of a normal law, errors.
@@ -410,6 +411,49 @@ def test_figures_of_trials_are_sums_over_pixels_beside_the_mean_chance(monkeypat
         for k, signal in enumerate(steady.signal_dn)
     ]  # fmt: skip
     np.testing.assert_allclose(figures["figure_noise_rate"], rates)
+
+
+def test_the_section_of_trials_has_the_mean_threshold_and_the_chances_of_its_families(monkeypatch):
+    """Thresholds are correlated; maps of ON and OFF are those of their polarity."""
+    names = trials_output.NAMES
+    values, covariance = 0.1 + 0.03 * np.arange(9), np.diag(np.arange(1.0, 10) ** 2 * 1e-6)
+    covariance[0, 1] = covariance[1, 0] = 0.7e-6
+    free = np.arange(9) != likelihood.LEAK
+    fit = SimpleNamespace(
+        values=values, covariance=covariance, law="sqrt", free=free, value=lambda name: values[names.index(name)],
+        error=lambda name: np.sqrt(covariance[names.index(name), names.index(name)]),
+    )  # fmt: skip
+    families = {"steps": 0.31, "times": 0.42, "steady": 0.53}
+    goodness = {name: SimpleNamespace(chi2=50.0, dof=10, p_value=p) for name, p in families.items()}
+    goodness["all"] = SimpleNamespace(chi2=90.0, dof=36, p_value=0.07)
+    light, shape = SimpleNamespace(signal_dn=np.array([30.0, 7.0]), shape=(2, 3), of=lambda good: good), (2, 3)
+    ones = np.arange(6.0)
+    result = SimpleNamespace(
+        fit=fit, advantage=5.1, goodness=goodness, findings=[], mismatch=SimpleNamespace(described=dict), steady=light,
+        steps=light, fitted=np.arange(5), relative=(ones, ones + 10), noise=(ones + 20, ones + 30),
+        defects=SimpleNamespace(
+            bad=ones == 2, kind=np.where(ones == 2, Defect.HOT, 0).astype(np.uint8), on_hz=ones, off_hz=ones,
+            firing_share=ones, change_hz=ones,
+        ),
+    )  # fmt: skip
+    found = trials_output.content(result)
+    check(found["theta"], 0.115, np.sqrt(1e-6 + 4e-6 + 1.4e-6) / 2, "ln")
+    check(found["theta_off"], 0.13, 2e-3, "ln")
+    assert (
+        found["shot_law_decisive"]
+        and not trials_output.content(SimpleNamespace(**{**vars(result), "advantage": -4.9}))["shot_law_decisive"]
+    )
+    assert found["leak_rate_hz"]["value"] == 0 and [each["signal_dn"] for each in found["noise"]] == [7, 30]
+    chances = {f"{name}_p_value": p for name, p in families.items()}
+    assert found["goodness"] == {"chi2_per_dof": 2.5, "dof": 36, "p_value": 0.07, **chances}
+    assert (found["fitted_pixels"], found["bad_pixels"], found["defects"]["hot"]) == (5, 1, 1)
+    monkeypatch.setattr(trials_output, "_figures", lambda fit, steady, steps: {"good": steady & steps})
+    maps = trials_output.maps(result)
+    assert maps.pop("good").tolist() == (ones != 2).tolist()
+    wanted = {"threshold_on_rel": 0, "threshold_off_rel": 10, "threshold_on_noise": 20, "threshold_off_noise": 30}
+    for name, offset in wanted.items():
+        np.testing.assert_array_equal(maps[name], (ones + offset).reshape(shape))
+    assert maps["bad_pixels"].shape == shape and maps["bad_pixels"][0, 2] and maps["bad_pixels"].sum() == 1
 
 
 ENTRY = SimpleNamespace(error=SpecError)
