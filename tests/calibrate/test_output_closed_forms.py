@@ -106,6 +106,54 @@ def test_noise_below_a_grey_value_is_that_of_the_long_series_less_what_else_it_h
             assert found["upper_limit"] == pytest.approx(limit / K) and f"at most {limit:.2g} DN" in found["reason"]
 
 
+@pytest.mark.parametrize("is_rounded", [False, True])
+def test_maps_of_emva_captures_are_their_patterns_without_rows_and_shading(monkeypatch, is_rounded):
+    """Pixels that are white or black are moved by the whole range; the figure's points have neither rounding nor
+    lines, and those that are not clear have no light.
+    """
+    rng, shape = np.random.default_rng(3), (4, 5)
+    row, col, pixel = rng.normal(2, 1, 4), rng.normal(0.7, 0.3, 5), rng.normal(0, 3, shape)
+    shade, whole = rng.uniform(-0.2, 0.2, shape), rng.uniform(-0.3, 0.3, shape)
+    whole[3, 3] = -1.4
+    white, black = np.zeros((2, *shape), bool)
+    white[1, 2] = black[0, 4] = True
+    levels, t = rng.normal(9, 1, shape), np.array([0.01, 0.013, 0.05])
+    monkeypatch.setattr(pairs_output, "stuck_pixels", lambda full, *_: (white, black) if full == 1023 else None)
+    monkeypatch.setattr(pairs_output, "levels_of", lambda mean, good, spread: levels * spread * mean * good)
+    monkeypatch.setattr(pairs_output, "_histogram", lambda result, series, signal: (series.name, signal))
+    monkeypatch.setattr(pairs_output, "_FIGURE_PX", 2)
+    lit = SimpleNamespace(mean=np.array([40.0, 90, 300]), variance=np.array([5.0, 8, 19]), exposure_s=t)
+    dark = SimpleNamespace(mean=np.array([10.0, 11, 12]), variance=np.array([3.0, 3.2, 3.4]), exposure_s=t)
+    result = SimpleNamespace(
+        pairs=SimpleNamespace(
+            shape=shape, spec=SimpleNamespace(full_scale_dn=1023), spatial_lit=SimpleNamespace(exposure_s=0.02)
+        ),
+        light_pattern=SimpleNamespace(shading=lambda: shade, whole=whole),
+        dark_pattern=SimpleNamespace(row=row, col=col, pixel=pixel),
+        rounded_noise=SimpleNamespace(spread=0.3) if is_rounded else None, defects=np.zeros(shape, bool),
+        long_dark=SimpleNamespace(name="dark", mean=np.full(shape, 1.7)), lit=lit, dark=dark, lines_dn2=0.4,
+        long_lit=SimpleNamespace(name="lit", mean=np.full(shape, 150.0), variance=rng.random(shape)),
+        clear=np.array([True, True, False]), signal=lit.mean - dark.mean, black=SimpleNamespace(slope=7.0, value=9.5),
+    )  # fmt: skip
+    found = pairs_output.maps(result)
+    offset = levels * 0.3 * 1.7 - row[:, None] if is_rounded else col + pixel
+    offset[1, 2], offset[0, 4] = offset[1, 2] + 1023, offset[0, 4] - 1023
+    response = (1 + whole) / (1 + shade)
+    response[0, 4] = response[3, 3] = 0
+    np.testing.assert_allclose(found["n_blc"], offset, rtol=1e-5)
+    np.testing.assert_allclose(found["response"], response, rtol=1e-6)
+    np.testing.assert_allclose(found["light_rel"], 1 + shade, rtol=1e-6)
+    assert (found["n_dp"] == 7).all() and found["n_row"] is row
+    assert found["figure_variance_map"].tolist() == result.long_lit.variance[::3, ::3].tolist()
+    assert found["figure_variance_exposure_us"] == pytest.approx(20_000)
+    assert (found["figure_noise_dark"], found["figure_noise_lit"]) == (("dark", 0.0), ("lit", 140.5))
+    known = [(0, 3.0), (0, 3.2), (0, 3.4), (30, 5.0), (79, 8.0)]
+    points = [(0, 0, 0.013, k > 2, x, v - 1 / 12 - 0.4, 20) for k, (x, v) in enumerate(known)]
+    np.testing.assert_allclose(found["figure_variance_points"], points)
+    result.black.slope = -2.0
+    assert not pairs_output.maps(result)["n_dp"].any()
+
+
 def test_efficiency_dark_current_and_full_well_of_emva_captures():
     value = 0.22 / K
     found = pairs_output._quantum_efficiency(calibration(), RELATIVE)
