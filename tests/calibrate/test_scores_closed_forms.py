@@ -277,3 +277,29 @@ def test_a_ceiling_below_1_is_told_beyond_its_error(value, error, is_told):
     assert (found is not None) is is_told
     if is_told:
         assert found.p_value == pytest.approx(norm.sf(0.02 / error), rel=1e-6, abs=0)
+
+
+def test_pixels_whose_thresholds_lie_apart_more_than_those_of_others(monkeypatch):
+    """Six spreads of θ₊ − θ₋ without its noise, and six errors of the pixel; beside them those beyond the means."""
+    rng, shape = np.random.default_rng(5), (20, 30)
+    on, off = rng.normal(1, 0.05, shape), rng.normal(1.02, 0.07, shape)
+    noise = rng.uniform(0.01, 0.04, (2, *shape))
+    good = rng.random(shape) < 0.9
+    places = [(3, 4), (3, 5), (11, 20), (11, 21)]
+    for place, away in zip(places, (9.0, 9.0, -9.0, -9.0), strict=True):
+        on[place], good[place] = away, True
+    apart = on - off
+    low, centre, high = np.quantile(apart[good], [0.16, 0.5, 0.84])
+    both = noise[0] ** 2 + noise[1] ** 2
+    spread = np.sqrt((high / 2 - low / 2) ** 2 - np.median(both[good]))
+    assert 0.02 < spread < 0.95 * (high - low) / 2
+    for place, part in zip(places, (0.99, 1.01, 0.99, 1.01), strict=True):
+        limit = part * (6 * spread + 6 * np.sqrt(both[place]))
+        on[place] = off[place] + centre + (limit if place[0] == 3 else -limit)
+    monkeypatch.setattr(defects, "totals_of", lambda thresholds, polarity, ends, trials: (700 + 40 * polarity, 400.0))
+    thresholds = SimpleNamespace(
+        mismatch_on=0.1, mismatch_off=0.1, pixel_on=on, pixel_off=off, noise_on=noise[0], noise_off=noise[1]
+    )
+    steps = SimpleNamespace(on_total=np.full(shape, 600), off_total=np.full(shape, 550), trials=50)
+    found = defects.bad_in_steps(steps, thresholds, good)
+    assert [tuple(place) for place in np.argwhere(found)] == [(3, 5), (11, 21)]
