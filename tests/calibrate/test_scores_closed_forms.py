@@ -303,3 +303,34 @@ def test_pixels_whose_thresholds_lie_apart_more_than_those_of_others(monkeypatch
     steps = SimpleNamespace(on_total=np.full(shape, 600), off_total=np.full(shape, 550), trials=50)
     found = defects.bad_in_steps(steps, thresholds, good)
     assert [tuple(place) for place in np.argwhere(found)] == [(3, 5), (11, 21)]
+
+
+def test_static_counts_of_pixels_whose_thresholds_lie_apart():
+    """Of three groups with medians of their own: deviates of the counts' shares, each with its counting error.
+
+    A twentieth of the pixels scatter by up to half of their threshold, about the limit.
+    """
+    rng, pixels, trials = np.random.default_rng(9), 700, 4000
+    group = rng.integers(0, 3, pixels)
+    middle = [np.array([1.4, 1.9, 0.25]), np.array([1.6, 1.7, 0.3])]
+    wide = np.where(rng.random(pixels) < 0.05, rng.uniform(-0.5, 0.5, pixels), 0.03 * rng.standard_normal(pixels))
+    chance = [norm.sf(own[group] * (1 + sign * wide)) for own, sign in zip(middle, (1, -1), strict=True)]
+    both = [rng.binomial(trials, one).astype(float) for one in chance]
+    both[0][:7] = 0  # too few events
+    found = defects._apart(both, group, trials, middle)
+    known = np.flatnonzero((both[0] >= 10) & (both[1] >= 10) & (group < 2))
+    differ, error = np.zeros(pixels), np.zeros(pixels)
+    for k in known:
+        u = (middle[0][group[k]] + middle[1][group[k]]) / 2
+        deviates = []
+        for counts, own in zip(both, middle, strict=True):
+            share = (counts[k] + 0.5) / (trials + 1)
+            deviates.append(norm.isf(share) - own[group[k]])
+            error[k] += share * (1 - share) / trials / norm.pdf(norm.isf(share)) ** 2 / u**2
+        differ[k] = (deviates[0] - deviates[1]) / u
+    low, centre, high = np.quantile(differ[known], [0.16, 0.5, 0.84])
+    spread = np.sqrt((high - low) ** 2 / 4 - np.median(error[known]))
+    limit = np.maximum(0.06, 6 * spread) + 6 * np.sqrt(error)
+    expected = np.isin(np.arange(pixels), known) & (np.abs(differ - centre) > limit)
+    assert 6 * spread > 0.06 and 5 < expected.sum() < 40
+    assert found.tolist() == expected.tolist()
