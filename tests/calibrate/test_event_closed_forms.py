@@ -14,6 +14,7 @@ from hesim_render.calibrate.evs import analysis, dispersion, thresholds
 from hesim_render.calibrate.evs import fit as events_fit
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_probability
+from hesim_render.calibrate.evs.steps import GROUPS
 
 #: θ₊, θ₋, s, κ.
 VALUES = np.array([0.21, 0.33, 0.05, 0.12])
@@ -413,3 +414,75 @@ def test_counts_of_trials_have_the_likelihood_of_their_outcomes(monkeypatch):
     posterior = np.exp(wanted - wanted.max(axis=1, keepdims=True)) * prior
     np.testing.assert_allclose(fit.law_given(counts), posterior / posterior.sum(axis=1, keepdims=True))
     np.testing.assert_allclose(fit.law_of_thresholds(1), prior / prior.sum())
+
+
+def test_sums_of_steps_give_the_variance_of_totals_and_the_noise_in_the_width(monkeypatch):
+    """Of good pixels, but for a group; the noise is what both widths have beyond the spread of their thresholds."""
+    rng, shape, trials = np.random.default_rng(7), (12, 15), 300
+    group, good = rng.integers(0, GROUPS, shape), rng.random(shape) < 0.8
+    totals = {"on_total": rng.integers(200, 400, shape), "off_total": rng.integers(100, 500, shape)}
+    pixels = np.bincount(group[good], minlength=GROUPS).astype(float)
+    on, off = rng.uniform(5, 60, (2, 4, GROUPS))
+    steps = SimpleNamespace(on=on, off=off, pixels=pixels, group=group, **totals)
+    step, asked = np.array([-0.3, -0.1, 0.2, 0.4]), []
+    monkeypatch.setattr(
+        thresholds, "_fit_curves", lambda *given: asked.append(given) or np.array([0.2, 0.3, 0.1, 0.15])
+    )
+    monkeypatch.setattr(thresholds, "_mismatch_square", lambda *given: asked.append(given) or 0.02 * len(asked))
+    sums = thresholds._Sums.of(steps, good)
+    for one, left in ((sums, good), (sums.without(3), good & (group != 3))):
+        asked.clear()
+        found = one.fit(step, trials, None)
+        keep = np.arange(GROUPS) != 3 if one is not sums else np.ones(GROUPS, bool)
+        rates, at, count, start = asked[0]
+        assert at is step and count == left.sum() * trials and start is None
+        np.testing.assert_allclose(rates, [each[:, keep].sum(axis=1) / count for each in (on, off)])
+        for k, (sign, name) in enumerate(((1, "on_total"), (-1, "off_total"))):
+            theta, width, slope, signed, variance, number = asked[1 + k]
+            assert (theta, width, slope, number) == ((0.2, 0.3)[k], 0.1, sign * 0.15, trials)
+            np.testing.assert_array_equal(signed, sign * step)
+            assert variance == pytest.approx(totals[name][left].var(ddof=1))
+        noise = np.sqrt(((0.1 * 1.15) ** 2 - 0.04 * 0.2**2 + (0.1 * 0.85) ** 2 - 0.06 * 0.3**2) / 2)
+        np.testing.assert_allclose(found, [0.2, 0.3, 0.1, 0.15, 0.04, 0.06, noise])
+
+
+@pytest.mark.parametrize("squares", [(0.012, 0.03), (0.0005, 0.03), (0.0002, 0.0003)])
+def test_a_mismatch_counts_beyond_errors_of_both_polarities_together(monkeypatch, squares):
+    """Jackknife over the groups that have pixels: (n − 1)/n Σ of squares; each polarity where both together show."""
+    rng = np.random.default_rng(3)
+    values = np.array([0.2, 0.3, 0.1, 0.05, *squares, 0.07])
+    left = values + rng.normal(size=(GROUPS, 7)) * [3e-3, 4e-3, 1e-3, 2e-3, 2e-4, 6e-4, 5e-4]
+    pixels = np.where(np.arange(GROUPS) == 5, 0.0, 30.0)
+
+    def of(steps, good):
+        return SimpleNamespace(
+            pixels=pixels, fit=lambda step, trials: values,
+            without=lambda k: SimpleNamespace(fit=lambda step, trials, start: left[k]),
+        )  # fmt: skip
+
+    def of_pixel(start, sign, signed, total, trials, m):
+        return (np.array([sign * signed[0], m]), total)
+
+    monkeypatch.setattr(thresholds, "_Sums", SimpleNamespace(of=of))
+    monkeypatch.setattr(thresholds, "_of_pixel", of_pixel)
+    steps = SimpleNamespace(trials=40, on_total="on", off_total="off")
+    found = thresholds.fit_thresholds(steps, np.array([0.4, 0.5]), None)
+    kept = left[pixels > 0]
+    n = len(kept)
+    covariance = (n - 1) / n * (kept - kept.mean(axis=0)).T @ (kept - kept.mean(axis=0))
+    error = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found.covariance, covariance[:4, :4])
+    assert found.theta == pytest.approx(0.25)
+    assert found.theta_error == pytest.approx(np.sqrt([0.5, 0.5] @ covariance[:2, :2] @ [0.5, 0.5]))
+    both, both_error = np.mean(squares), np.sqrt([0.5, 0.5] @ covariance[4:6, 4:6] @ [0.5, 0.5])
+    shows = both > thresholds._SIGMAS * both_error
+    assert shows == (squares[1] > 0.01)
+    own = [np.sqrt(v) if shows and v > thresholds._SIGMAS * e else 0 for v, e in zip(squares, error[4:6], strict=True)]
+    assert (own[0] > 0) == (squares[0] > 0.01)
+    assert (found.mismatch_on, found.mismatch_off) == pytest.approx(own)
+    assert found.spread.value == pytest.approx(np.sqrt(both) if shows else 0)
+    assert found.spread.error == pytest.approx(both_error / (2 * np.sqrt(both)) if shows else np.nan, nan_ok=True)
+    assert found.spread.limit == pytest.approx(np.sqrt(both + 2 * both_error)) and found.spread.groups == GROUPS
+    assert found.noise == pytest.approx((0.07, error[6]))
+    np.testing.assert_allclose([found.pixel_on, found.pixel_off], [[0.4, own[0]], [0.4, own[1]]])
+    assert (found.noise_on, found.noise_off) == ("on", "off")
