@@ -486,3 +486,34 @@ def test_a_mismatch_counts_beyond_errors_of_both_polarities_together(monkeypatch
     assert found.noise == pytest.approx((0.07, error[6]))
     np.testing.assert_allclose([found.pixel_on, found.pixel_off], [[0.4, own[0]], [0.4, own[1]]])
     assert (found.noise_on, found.noise_off) == ("on", "off")
+
+
+def test_first_events_are_means_over_the_noise_at_the_reset():
+    """A trapezoid rule over that noise. Calm trials count by their chance to be so while settling, but for the first
+    0.15 of a period, in which the noise stays. What lies beyond a threshold after the step passes with it.
+    """
+    theta, other, step, cutoff, settle, leak = 0.3, 0.36, 0.11, 40.0, 0.009, (2.0, 3.0)
+    before, after, edges = 0.17, 0.2, np.array([0.0, 0.004, 0.02])
+    z = np.linspace(-8, 8, 4001)
+    h = 2 * np.pi * cutoff * settle / np.sqrt(np.sqrt(2) - 1)
+    rho = (1 + h) * np.exp(-h)
+    fresh = np.sqrt(1 - rho**2)
+
+    def rate(level):
+        return cutoff * likelihood.passage_rate(level)
+
+    high, low = theta / before + z, other / before - z
+    weight = norm.pdf(z) * np.exp(-(rate(high) + rate(low) + 5.0) * (settle - 0.15 / cutoff))
+    up, down = (theta - step + before * z) / after, (other + step - before * z) / after
+    calm = norm.cdf(high, rho * z, fresh) - norm.cdf(-low, rho * z, fresh)
+    first = np.maximum(norm.cdf(high, rho * z, fresh) - norm.cdf(up, rho * z, fresh), 0) / calm
+    first_other = np.maximum(norm.cdf(-down, rho * z, fresh) - norm.cdf(-low, rho * z, fresh), 0) / calm
+    own, others = rate(up) + leak[0], rate(down) + leak[1]
+    found = likelihood.first_event(theta, other, step, (before, after), cutoff, settle, edges, leak)
+    for k, (at_once, mine) in enumerate(((first, own), (first_other, others))):
+        for j in range(2):
+            left = (1 - first - first_other) * (
+                np.exp(-(own + others) * edges[j]) - np.exp(-(own + others) * edges[j + 1])
+            )
+            chance = (at_once if j == 0 else 0.0) + left * mine / (own + others)
+            assert found[k][j] == pytest.approx(np.sum(weight * chance) / weight.sum(), rel=2e-3)

@@ -142,6 +142,21 @@ def test_one_law_is_likelier_by_the_scatter_of_the_counts():
     assert analysis._likelier({"sqrt": one_fit()}) == "sqrt"
 
 
+def test_medians_tell_a_law_by_the_lead_over_the_smaller_scatter(monkeypatch):
+    """Both laws are fitted unless the lead leaves no doubt."""
+    starts = {"linear": ("a", -500.0, 4.0), "sqrt": ("b", -440.0, 5.0)}
+    monkeypatch.setattr(analysis, "Typical", SimpleNamespace(of=lambda *_: SimpleNamespace(cells="cells")))
+    monkeypatch.setattr(analysis, "best_start", lambda cells, theta_v, law: starts[law])
+    begun = analysis._Begun.of(None, None, 0.7)
+    assert begun.lead == pytest.approx(15) and begun.starts == {"linear": "a", "sqrt": "b"} and begun.theta_v == 0.7
+    sure, doubt = analysis.DECISIVE, analysis._BEYOND_DOUBT
+    for lead, law in ((1.01 * sure, "sqrt"), (0.99 * sure, "linear"), (-1.01 * sure, "linear")):
+        assert begun._replace(lead=lead).law == law
+    for lead, wanted in ((0.99 * doubt, 2), (1.01 * doubt, ("sqrt",)), (-1.01 * doubt, ("linear",))):
+        found = begun._replace(lead=lead).wanted
+        assert found == wanted or len(found) == wanted
+
+
 def test_brightness_and_events_that_tell_nothing_are_refused(tmp_path):
     captures, good = SimpleNamespace(folder=tmp_path), np.ones((3, 4), bool)
 
