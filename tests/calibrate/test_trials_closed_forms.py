@@ -248,6 +248,19 @@ def test_pixels_are_plainly_bad_by_polarity_calm_and_events_in_the_brightest_lig
     assert np.flatnonzero(found).tolist() == [*([11] if more else []), *([] if more else [30]), 40, 41]
 
 
+@pytest.mark.parametrize(("others", "is_bad"), [(1, True), (3, False)])
+def test_what_is_usual_counts_an_event_of_each_of_the_few_pixels_that_have_any(others, is_bad):
+    """One of 400 pixels has three events: a chance of 2e-8 where 2 of 400 have any, and of 2e-7 where 4 have."""
+    on = np.zeros((1, 2, 400), int)
+    on[0, 0, 7] = 3
+    on[0, 1, 20 : 20 + others] = 2
+    steady = trials_of(on, 0 * on, np.full((1, 400), 200), [80.0])
+    ones = np.ones((2, 2, 400), int)
+    steps = trials_of(ones, ones, np.full((2, 400), 50), [80.0, 80.0], [0.3, -0.3])
+    assert (poisson.sf(2, (1 + others) / 400) < 1e-7) == is_bad
+    assert np.flatnonzero(defects.plainly_bad(steady, steps)).tolist() == ([7] if is_bad else [])
+
+
 def test_kinds_of_bad_pixels():
     """Stuck: no event from a step; hot: hardly calm, or more events than chance gives (1e-3); else other."""
     pixels = 50
