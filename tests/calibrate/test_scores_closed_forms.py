@@ -334,15 +334,11 @@ def test_static_counts_of_pixels_whose_thresholds_lie_apart():
     both[0][:7] = 0  # too few events
     found = defects._apart(both, group, trials, middle)
     known = np.flatnonzero((both[0] >= 10) & (both[1] >= 10) & (group < 2))
-    differ, error = np.zeros(pixels), np.zeros(pixels)
-    for k in known:
-        u = (middle[0][group[k]] + middle[1][group[k]]) / 2
-        deviates = []
-        for counts, own in zip(both, middle, strict=True):
-            share = (counts[k] + 0.5) / (trials + 1)
-            deviates.append(norm.isf(share) - own[group[k]])
-            error[k] += share * (1 - share) / trials / norm.pdf(norm.isf(share)) ** 2 / u**2
-        differ[k] = (deviates[0] - deviates[1]) / u
+    share = (np.stack(both) + 0.5) / (trials + 1)
+    u = (middle[0] + middle[1])[group] / 2
+    deviates = norm.isf(share) - np.stack(middle)[:, group]
+    differ = (deviates[0] - deviates[1]) / u
+    error = np.sum(share * (1 - share) / trials / norm.pdf(norm.isf(share)) ** 2, axis=0) / u**2
     low, centre, high = np.quantile(differ[known], [0.16, 0.5, 0.84])
     spread = np.sqrt((high - low) ** 2 / 4 - np.median(error[known]))
     limit = np.maximum(0.06, 6 * spread) + 6 * np.sqrt(error)
