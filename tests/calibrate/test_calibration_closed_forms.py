@@ -837,6 +837,34 @@ def test_without_maps_of_frames_there_is_no_signal_at_event_pixels(tmp_path, mon
             counts._composite_signal(captures, calibration, tmp_path / "evs_static.npz")
 
 
+@pytest.mark.parametrize(("changes", "shape", "tile"), [
+    ({"grid": (1, 3), "stated": (2, 2)}, (6, 9), (1, 3)), ({"stated": (2, 1)}, (6, 9), (2, 1)),
+    # of frames of 8 × 12 px in tiles of 4 × 3; of another aspect, or not of whole tiles, the sizes tell nothing
+    ({"frames": (8, 12)}, (4, 6), (2, 1)), ({"frames": (8, 12)}, (8, 6), (4, 3)),
+    ({"frames": (24, 36)}, (4, 6), (4, 3)),
+    ({}, (8, 9), (4, 3)), ({}, (6, 9), "whole tiles"), ({}, (8, 10), "whole tiles"),
+    ({"grid": (0, 3)}, (6, 9), "whole"), ({"grid": (1, 3), "roi": (24, 9)}, (6, 9), (1, 3)),
+    ({"grid": (1, 3), "roi": (24, 12)}, (6, 9), "24×9 frame pixels"),
+    ({"grid": (1, 3), "roi": (20, 9)}, (6, 9), "24×9 frame pixels"),
+])  # fmt: skip
+def test_tiles_of_event_maps_are_stated_or_follow_from_the_sizes_of_both_grids(changes, shape, tile, tmp_path):
+    grid, stated, frames, roi = (changes.get(name) for name in ("grid", "stated", "frames", "roi"))
+    of_sensor = None if grid is None else SimpleNamespace(rows_per_tile=grid[0], cols_per_tile=grid[1])
+    captures = SimpleNamespace(
+        sensor=None if grid is None else SimpleNamespace(evs_grid=of_sensor), folder=tmp_path,
+        has=lambda name: frames is not None, frames=lambda name: SimpleNamespace(shape=(3, 5, *frames)),
+        spec=SimpleNamespace(
+            tile_rows=4, tile_cols=3, evs_tile_rows=stated and stated[0], evs_tile_cols=stated and stated[1],
+            roi=None if roi is None else SimpleNamespace(height_px=roi[0], width_px=roi[1]),
+        ),
+    )  # fmt: skip
+    if isinstance(tile, str):
+        with pytest.raises(SpecError, match=tile):
+            counts.event_tile(captures, shape)
+    else:
+        assert counts.event_tile(captures, shape) == tile
+
+
 @pytest.mark.parametrize("part", [8, 12, 40])
 def test_parts_of_a_dark_capture_are_eight_or_more_and_add_up(part):
     rng = np.random.default_rng(1)
