@@ -7,7 +7,7 @@ import pytest
 
 from hesim_render.calibrate.recordings import noise_spread as of_noise
 from hesim_render.calibrate.recordings.noise_spread import KEYS, noise_spread, surest
-from hesim_render.calibrate.recordings.tally import tally
+from hesim_render.calibrate.recordings.tally import GROUPS, tally
 from hesim_render.exchange import EventStream
 from tests.support.still_pixels import random_events, still_events
 
@@ -135,6 +135,8 @@ def test_of_several_recordings_the_surest_counts():
     found = surest(given)
     assert found["bandwidth_rel"] is narrow and found["odd_cols_rel"] is limit
     assert surest([given[0], given[0]])["bandwidth_rel"] is reason
+    narrow, low = ({key: {"interval_95": interval} for key in KEYS} for interval in ([0.5, 0.6], [0.1, 0.4]))
+    assert surest([low, narrow]) == surest([narrow, low]) == narrow
 
 
 def test_random_events_without_noise_of_a_level_have_no_spread_beyond_their_limit():
@@ -144,3 +146,37 @@ def test_random_events_without_noise_of_a_level_have_no_spread_beyond_their_limi
     )
     assert found["bandwidth_rel"]["value"] == 0 and found["bandwidth_rel"]["upper_limit"] < 0.1
     assert of_noise._TURN.size == of_noise._FALL.size
+
+
+def test_sums_patterns_and_covariances_are_those_of_a_loop_over_pixels():
+    """Of used pixels of 7 × 9, by even or odd row and column: counts of both halves and their products."""
+    rng, shape = np.random.default_rng(6), (7, 9)
+    counts, group = rng.integers(1, 30, (4, 63)).astype(float), rng.integers(0, GROUPS, 63)
+    used = rng.random(63) < 0.9
+    given = SimpleNamespace(pixels=63, shape=shape, group=group.astype(np.uint64), used=used)
+    sums = of_noise._sums(given, counts)
+    wanted = np.zeros((9, 4, GROUPS))
+    for k in np.flatnonzero(used):
+        on, late_on, off, late_off = counts[:, k]
+        own = [1, on, late_on, off, late_off, on * late_on, off * late_off, on * late_off, late_on * off]
+        wanted[:, 2 * (k // 9 % 2) + k % 9 % 2, group[k]] += own
+    np.testing.assert_allclose(sums, wanted)
+    whole = wanted.sum(axis=2, keepdims=True)
+    row, col = np.divmod(np.arange(63), 9)
+    total = counts.sum(axis=0)
+
+    def of(is_odd_row, is_odd_col, values):
+        return values[used & (row % 2 == is_odd_row) & (col % 2 == is_odd_col)].mean()
+
+    for bit, place in ((2, lambda a, b: (a, b)), (1, lambda a, b: (b, a))):
+        odd, even = (np.mean([of(*place(is_odd, k), total) for k in (0, 1)]) for is_odd in (1, 0))
+        np.testing.assert_allclose(of_noise._pattern(whole, bit), (odd - even) / (odd + even))
+    own, both = of_noise._covariances(whole)
+    expected = np.zeros(2)
+    for a in (0, 1):
+        for b in (0, 1):
+            share = np.sum(used & (row % 2 == a) & (col % 2 == b)) / used.sum()
+            for k, (i, j) in enumerate(((0, 1), (2, 3), (0, 3), (1, 2))):
+                log = np.log(of(a, b, counts[i] * counts[j]) / (of(a, b, counts[i]) * of(a, b, counts[j])))
+                expected[k // 2] += 0.5 * share * log
+    np.testing.assert_allclose([own[0], both[0]], expected)

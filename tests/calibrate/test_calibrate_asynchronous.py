@@ -8,7 +8,7 @@ import pytest
 import reset_captures
 from reset_captures import Pixels
 from scipy.special import ndtr
-from scipy.stats import binom
+from scipy.stats import binom, poisson
 from scipy.stats import f as f_law
 
 import hesim_render as hr
@@ -148,6 +148,101 @@ def test_a_column_is_judged_from_25_events_and_25_trials_without_one(monkeypatch
     columns = checks._columns(fit)
     assert columns.expected == pytest.approx([26, 20, 74]) and columns.silent == pytest.approx([74, 80, 26])
     assert columns.residual == pytest.approx(np.array([[-2, 1, 3], [1, 7, 0]])) and columns.family.tolist() == [1, 0, 1]
+
+
+def test_columns_are_counts_less_the_mean_over_each_pixels_own_thresholds(monkeypatch):
+    """Both polarities, with two steady lights and three steps of two bins; expected are those of its own trials."""
+    rng, pixels = np.random.default_rng(3), 7
+    sets = [SimpleNamespace(contrast=np.zeros(2)), SimpleNamespace(contrast=np.array([0.1, 0.3, 0.4]))]
+    monkeypatch.setattr(checks, "_FEWEST", 0.0)
+    table = {(len(one.contrast), polarity): rng.uniform(0.1, 0.3, (len(one.contrast), 2, 4))
+             for one in sets for polarity in (1, -1)}  # fmt: skip
+    monkeypatch.setattr(checks, "chances", lambda values, trials, polarity, *_: table[len(trials.contrast), polarity])
+    weights = {polarity: rng.dirichlet(np.ones(4), pixels) for polarity in (1, -1)}
+    counts = [
+        SimpleNamespace(
+            polarity=polarity, sets=sets, events=rng.integers(20, 40, (pixels, 10)),
+            silent=rng.integers(100, 200, (pixels, 5)),
+        )
+        for polarity in (1, -1)
+    ]  # fmt: skip
+    fit = SimpleNamespace(
+        likelihood=SimpleNamespace(counts=counts, grids=[None, None]), values=None, law="sqrt",
+        law_given=lambda counts: weights[counts.polarity],
+    )  # fmt: skip
+    found = checks._columns(fit)
+    column = 0
+    for one in counts:
+        for kind in range(5):
+            chance = table[(2, one.polarity) if kind < 2 else (3, one.polarity)][kind if kind < 2 else kind - 2]
+            trials = one.events[:, 2 * kind : 2 * kind + 2].sum(axis=1) + one.silent[:, kind]
+            for j in range(2):
+                expected = trials * (weights[one.polarity] @ chance[j])
+                np.testing.assert_allclose(found.residual[:, column], one.events[:, 2 * kind + j] - expected)
+                assert found.expected[column] == pytest.approx(expected.sum())
+                assert found.silent[column] == pytest.approx(trials.sum() - expected.sum())
+                assert found.family[column] == (2 if kind < 2 else j)
+                column += 1
+    assert column == found.family.size
+
+
+def test_pixels_are_judged_by_poisson_tails_over_what_their_thresholds_may_be(monkeypatch):
+    """Tails of 40 pixels against 0.3, by loops over kinds of trial, bins and thresholds."""
+    rng, pixels, grid = np.random.default_rng(11), 40, np.array([0.2, 0.25, 0.3])
+    alike = {"settle_s": 1e-3, "edges_s": np.array([0.0, 1e-3, 4e-3]), "shape": (1, pixels)}
+    on = rng.binomial(40, np.array([0.03, 0.35, 0.47])[:, None, None], (3, 2, pixels))
+    steps = Trials(signal_dn=np.full(3, 90.0), contrast=np.array([0.05, 0.2, 0.4]), calm=np.full((3, pixels), 100),
+                   on=on, off=0 * on, **alike)  # fmt: skip
+    seen = rng.poisson(0.5, (3, 2, pixels))
+    steady = Trials(signal_dn=np.array([5.0, 20.0, 90.0]), contrast=np.zeros(3), calm=rng.integers(50, 90, (3, pixels)),
+                    on=seen, off=rng.poisson(0.3, (3, 2, pixels)), **alike)  # fmt: skip
+    of_steps = np.array([[0.004, 0.006, 0.013], [0.4, 0.35, 0.3], [0.494, 0.4935, 0.48]])[:, None] * np.ones((2, 1))
+    of_steady = np.array([[0.004, 0.002, 0.001], [0.006, 0.005, 0.003], [0.002, 0.004, 0.006]])[:, None]
+    of_steady = of_steady * np.array([[1.0], [1.6]])
+    monkeypatch.setattr(defects, "chances", lambda _, trials, *__: of_steps if trials.contrast.any() else of_steady)
+    monkeypatch.setattr(defects, "_CHANCE", 0.3)
+    weight = rng.dirichlet(np.ones(3), pixels)
+    fit = SimpleNamespace(
+        values=None, law="sqrt", likelihood=SimpleNamespace(grids=[grid, None]), law_given=lambda counts: weight
+    )
+    found = defects._tests(fit, steady, steps, 1)
+    assert found.shape == (3, pixels) and np.all((found.mean(axis=1) > 0.05) & (found.mean(axis=1) < 0.95))
+    for pixel in range(pixels):
+        tails = np.zeros(3)
+        quiet = steady.calm[:, pixel] - steady.off[:, :, pixel].sum(axis=1)
+        for k, w in enumerate(weight[pixel]):
+            chance = of_steps[:, :, k].sum(axis=1)
+            count = np.array([seen[:, :, pixel].sum(), 0, 0])
+            mean = np.array([quiet @ of_steady[:, :, k].sum(axis=1), 1e-12, 1e-12])
+            for kind in range(3):
+                events = on[kind, :, pixel].sum()
+                if chance[kind] > 0.98:
+                    count[1] += 100 - events
+                    mean[1] += 100 * (1 - chance[kind])
+                if chance[kind] < 0.02:
+                    count[2] += events
+                    mean[2] += 100 * chance[kind]
+            tails += w * poisson.sf(count - 1, mean)
+        assert found[:, pixel].tolist() == (tails < 0.3).tolist()
+
+
+def test_a_family_is_judged_without_what_the_fit_removed_and_with_the_error_of_the_law():
+    """Steps to 0.2 %, times to 3 %, of events with a binomial variance; scores of two of three parameters are free."""
+    rng, count = np.random.default_rng(17), 50
+    scores = rng.normal(0.2, 1.0, (count, 3))
+    residual = rng.normal(0.3, [3.0, 2.0, 4.0], (count, 3)) + scores @ rng.normal(0.0, 1.0, (3, 3))
+    expected, silent = np.array([900.0, 70.0, 1500.0]), np.array([300.0, 700.0, 90.0])
+    columns = SimpleNamespace(residual=residual, expected=expected, silent=silent, family=np.array([0, 2, 1]))
+    free = np.array([True, False, True])
+    found = checks._judge(columns, np.arange(3), SimpleNamespace(scores=scores, free=free))
+    basis = np.linalg.qr(scores[:, free])[0]
+    left = residual - basis @ (basis.T @ residual)
+    error = np.array([0.002, 0.03, 0.03]) * expected * silent / (expected + silent)
+    covariance = (count - 1) * np.cov(left, rowvar=False) * (1 + 1 / count) + np.diag(error**2)
+    total = left.sum(axis=0)
+    chi2 = total @ np.linalg.solve(covariance, total)
+    assert (found.chi2, found.dof) == (pytest.approx(chi2), 3)
+    assert found.p_value == pytest.approx(f_law.sf(chi2 * (count - 3) / (3 * (count - 1)), 3, count - 3))
 
 
 def test_events_where_there_can_be_none_are_counted_in_those_trials_alone(monkeypatch):

@@ -622,7 +622,7 @@ def test_the_width_of_s_curves_is_compared_with_the_noise_of_the_static_counts(c
     covariance[1, 1] = 0.09**2
     error = np.sqrt((0.0011 / measured) ** 2 + 0.01**2 + 0.02**2)
 
-    def told(share):
+    def told(share, measured=measured, given=given):
         """What is found where Θ is such that the static counts ask for a share of the measured noise."""
         fit = SimpleNamespace(
             values=natural_values, parameters=from_natural(natural_values), covariance=covariance, law=law,
@@ -637,6 +637,10 @@ def test_the_width_of_s_curves_is_compared_with_the_noise_of_the_static_counts(c
     assert told(1.02) is None
     for share in (0.86, 1.17):
         assert told(share).p_value == pytest.approx(2 * ndtr(-abs(np.log(share)) / error), rel=1e-6)
+    # noise that is not known to a quarter tells nothing, and a mismatch beyond the width is not taken from it
+    for part, is_told in ((0.245, True), (0.255, False)):
+        assert (told(0.2, given=replace(given, noise=(0.062, part * measured))) is not None) == is_told
+    assert told(0.8, 0.062, replace(given, width=0.0305)) is not None
 
 
 def test_noise_of_the_frames_makes_no_edge_of_an_even_scene():
@@ -690,6 +694,20 @@ def test_floors_and_ceiling_of_exact_curves_are_found():
     found = curve_levels(steps, SimpleNamespace(values=values * [1.02, 0.98, 1.05, 1.0], step=step))
     for (value, error), true in zip((found.floor_on, found.floor_off, found.ceiling), (*floors, ceiling), strict=True):
         assert value == pytest.approx(true, abs=1e-6) and error < 1e-6
+
+
+def test_errors_of_floors_and_ceiling_are_those_of_leaving_groups_out(monkeypatch):
+    """Of the groups that have pixels."""
+    pixels = np.where(np.arange(GROUPS) == 3, 0.0, 40.0)
+    own = np.random.default_rng(2).normal(size=(GROUPS, 7))
+    monkeypatch.setattr(event_checks, "_fit", lambda steps, step, groups, start: own[groups].sum(axis=0))
+    given = SimpleNamespace(values=np.ones(4), step=None)
+    found = curve_levels(SimpleNamespace(pixels=pixels), given)
+    for k, (value, error) in zip((4, 5, 6), (found.floor_on, found.floor_off, found.ceiling), strict=True):
+        without = own[:, k].sum() - own[pixels > 0, k]
+        assert value == pytest.approx(own[:, k].sum())
+        count = GROUPS - 1
+        assert error == pytest.approx(np.sqrt((count - 1) / count * np.sum((without - without.mean()) ** 2)))
 
 
 def test_noise_of_two_equal_poles_has_its_correlation():
@@ -819,16 +837,46 @@ def test_without_maps_of_frames_there_is_no_signal_at_event_pixels(tmp_path, mon
             counts._composite_signal(captures, calibration, tmp_path / "evs_static.npz")
 
 
+@pytest.mark.parametrize(("changes", "shape", "tile"), [
+    ({"grid": (1, 3), "stated": (2, 2)}, (6, 9), (1, 3)), ({"stated": (2, 1)}, (6, 9), (2, 1)),
+    # of frames of 8 × 12 px in tiles of 4 × 3; of another aspect, or not of whole tiles, the sizes tell nothing
+    ({"frames": (8, 12)}, (4, 6), (2, 1)), ({"frames": (8, 12)}, (8, 6), (4, 3)),
+    ({"frames": (24, 36)}, (4, 6), (4, 3)),
+    ({}, (8, 9), (4, 3)), ({}, (6, 9), "whole tiles"), ({}, (8, 10), "whole tiles"),
+    ({"grid": (0, 3)}, (6, 9), "whole"), ({"grid": (1, 3), "roi": (24, 9)}, (6, 9), (1, 3)),
+    ({"grid": (1, 3), "roi": (24, 12)}, (6, 9), "24×9 frame pixels"),
+    ({"grid": (1, 3), "roi": (20, 9)}, (6, 9), "24×9 frame pixels"),
+])  # fmt: skip
+def test_tiles_of_event_maps_are_stated_or_follow_from_the_sizes_of_both_grids(changes, shape, tile, tmp_path):
+    grid, stated, frames, roi = (changes.get(name) for name in ("grid", "stated", "frames", "roi"))
+    of_sensor = None if grid is None else SimpleNamespace(rows_per_tile=grid[0], cols_per_tile=grid[1])
+    captures = SimpleNamespace(
+        sensor=None if grid is None else SimpleNamespace(evs_grid=of_sensor), folder=tmp_path,
+        has=lambda name: frames is not None, frames=lambda name: SimpleNamespace(shape=(3, 5, *frames)),
+        spec=SimpleNamespace(
+            tile_rows=4, tile_cols=3, evs_tile_rows=stated and stated[0], evs_tile_cols=stated and stated[1],
+            roi=None if roi is None else SimpleNamespace(height_px=roi[0], width_px=roi[1]),
+        ),
+    )  # fmt: skip
+    if isinstance(tile, str):
+        with pytest.raises(SpecError, match=tile):
+            counts.event_tile(captures, shape)
+    else:
+        assert counts.event_tile(captures, shape) == tile
+
+
 @pytest.mark.parametrize("part", [8, 12, 40])
 def test_parts_of_a_dark_capture_are_eight_or_more_and_add_up(part):
     rng = np.random.default_rng(1)
-    parts = rng.integers(0, 5, (part, 3, 4))
+    parts = rng.integers(0, 5, (part, 7, 4))
+    moved = parts.copy()
+    moved[:2, 0, 0] += [-10, 10]
     on = parts.sum(axis=0) // 3
     maps = {"dark_n_on": on, "dark_n_off": parts.sum(axis=0) - on}
     assert counts._parts({"dark_parts": parts}, maps, 120, "a.npz") is parts
     for wrong, trials, words in (
         (parts[:7], 70, "holds 7 parts"), (parts, 119, "a divisor of n_trials"), (parts[:, :2], 120, "whole numbers"),
-        (parts + 1, 120, "does not add up"), (parts * 1.0, 120, "whole numbers"),
+        (parts + 1, 120, "does not add up"), (moved, 120, "does not add up"), (parts * 1.0, 120, "whole numbers"),
     ):  # fmt: skip
         with pytest.raises(SpecError, match=words):
             counts._parts({"dark_parts": wrong}, maps, trials, "a.npz")

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.special import ndtr
-from scipy.stats import norm
+from scipy.stats import multivariate_normal, norm
 
 from hesim_render.calibrate.asynchronous import analysis as trials_analysis
 from hesim_render.calibrate.asynchronous import fit as trials_fit
@@ -14,6 +14,7 @@ from hesim_render.calibrate.evs import analysis, dispersion, thresholds
 from hesim_render.calibrate.evs import fit as events_fit
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_probability
+from hesim_render.calibrate.evs.steps import GROUPS
 
 #: θ₊, θ₋, s, κ.
 VALUES = np.array([0.21, 0.33, 0.05, 0.12])
@@ -218,11 +219,11 @@ def test_pooled_s_curves_have_the_moments_of_their_law():
     steps = SimpleNamespace(**{**vars(steps), "events": lambda polarity: both[polarity]})
     for s in (1, -1):
         np.testing.assert_allclose(trials_fit.pixel_thresholds(steps, s), centre[s], atol=2e-3)
-    # of several lights the brightest of that polarity, whatever those of the other are
-    lights = {1: 70.0, -1: 41.0}
+    # of several lights the brightest of that polarity, to a thousandth, whatever those of the other are
+    bright = np.where(sign > 0, 70.0, 41.0) * np.where(np.abs(contrast) < 0.3, 0.9996, 1)
     more = [size[:3] * s for s in (1, -1)]
     unlike = SimpleNamespace(
-        signal_dn=np.concatenate([[lights[s] for s in sign], [31.0] * 3, [17.0] * 3]),
+        signal_dn=np.concatenate([bright, [31.0] * 3, [17.0] * 3]),
         contrast=np.concatenate([contrast, *more]), calm=np.concatenate([calm, calm[:6]]),
         events=lambda polarity: np.concatenate([both[polarity], np.zeros((6, 2, 3))]),
     )  # fmt: skip
@@ -338,6 +339,24 @@ def test_each_polarity_of_a_trial_has_its_own_threshold_leak_and_grid(monkeypatc
     for k, polarity in enumerate((1, -1)):
         likelihood.chances(values, trials, polarity, grids[k], "sqrt")
     assert seen == [(grids[0].tolist(), 0.31, (0.04, 0.0)), (grids[1].tolist(), 0.2, (0.0, 0.04))]
+    # step and noise by their definitions, and chances among the trials that the other polarity has not ended
+    rng, law = np.random.default_rng(2), {"linear": 2, "sqrt": 1}
+    own, other, given = rng.uniform(0, 0.2, (2, 2, 3)), rng.uniform(0, 0.3, (2, 2, 3)), []
+    monkeypatch.setattr(likelihood, "first_event", lambda *some: given.append(some) or (own, other))
+    values[likelihood.RESPONSE], values[likelihood.SHOT], values[likelihood.DARK] = 0.07, 0.003, 0.0021
+    trials.edges_s = np.array([0.0, 0.1, 0.3])
+    after = trials.signal_dn * np.exp(trials.contrast)
+    for name, power in law.items():
+        for k, polarity in enumerate((1, -1)):
+            chance = likelihood.chances(values, trials, polarity, grids[k], name)
+            np.testing.assert_allclose(chance, np.moveaxis(own / (1 - other[0] - other[1]), 0, 1))
+            _, _, step, noise, *_ = given.pop()
+            np.testing.assert_allclose(
+                step[:, 0], polarity * np.log((1 + 0.07 * after) / (1 + 0.07 * trials.signal_dn))
+            )
+            for sigma, light in zip(noise, (trials.signal_dn, after), strict=True):
+                variance = (0.003 * light**power + 0.0021) / (1 + 0.07 * light) ** 2
+                np.testing.assert_allclose(sigma[:, 0] ** 2, variance + (1e-3 * 0.2) ** 2)
     weight = np.array([[0.2, 0.5, 0.3], [0.0, 0.9, 0.1]])
     monkeypatch.setattr(trials_analysis, "TrialCounts", SimpleNamespace(of=lambda sets, polarity: polarity))
     some = SimpleNamespace(calm=np.zeros((2, 2)), of=lambda which: which)
@@ -350,3 +369,151 @@ def test_each_polarity_of_a_trial_has_its_own_threshold_leak_and_grid(monkeypatc
         np.testing.assert_allclose(mean, weight[::polarity] @ relative, rtol=1e-6)
         wanted = np.sqrt(weight[::polarity] @ relative**2 - (weight[::polarity] @ relative) ** 2)
         np.testing.assert_allclose(spread, wanted, rtol=1e-4)
+
+
+def test_noise_passes_a_level_at_the_rate_of_its_crossings_and_their_clumps():
+    """Rice's rate at two equal poles times κ, ln κ a polynomial from −1.5 to 6, a line below, even above."""
+    h = np.array([-4.0, -2.0, -1.0, 0.0, 0.7, 2.5, 4.5, 6.0, 7.5])
+    inside = np.clip(h, -1.5, 6.0)
+    kappa = sum(factor * inside ** (7 - k) for k, factor in enumerate(likelihood._LOG_KAPPA))
+    kappa += -2.112 * np.minimum(h + 1.5, 0)
+    crossings = np.exp(-(h**2) / 2) / np.sqrt(np.sqrt(2) - 1)
+    np.testing.assert_allclose(likelihood.passage_rate(h), crossings * np.exp(kappa), rtol=1e-9)
+    # of lines between nodes 1/16 of a period apart, far up: the chance of being below at one and above at the next.
+    # The variance of a line is (2 + ρ)/3 of that of its nodes on the average
+    step = 2 * np.pi / 16 / np.sqrt(np.sqrt(2) - 1)
+    rho = (1 + step) * np.exp(-step)
+    for level in (4.0, 5.0):
+        node = level * np.sqrt((2 + rho) / 3)
+        both = multivariate_normal.cdf([-node, -node], cov=[[1, rho], [rho, 1]])
+        assert likelihood.passage_rate(np.array(level)) == pytest.approx(16 * (norm.sf(node) - both), rel=0.02)
+
+
+def test_counts_of_trials_have_the_likelihood_of_their_outcomes(monkeypatch):
+    """Each event has the chance of its kind and bin, each silent trial that of none; a posterior adds up to 1."""
+    rng, grid = np.random.default_rng(4), np.array([0.15, 0.2, 0.25, 0.3])
+    tables = {"a": rng.uniform(0.05, 0.3, (2, 3, 4)), "b": rng.uniform(0.05, 0.4, (1, 2, 4))}
+    monkeypatch.setattr(likelihood, "chances", lambda values, trials, polarity, grid, law: tables[trials])
+    events, silent = rng.integers(0, 9, (5, 8)).astype(float), rng.integers(0, 40, (5, 3)).astype(float)
+    counts = likelihood.TrialCounts(-1, ["a", "b"], events, silent)
+    found = counts.log_likelihood(None, grid, "sqrt")
+    wanted = np.zeros((5, 4))
+    for pixel in range(5):
+        column = 0
+        for number, chance in enumerate([*tables["a"], *tables["b"]]):
+            for of_bin in chance:
+                wanted[pixel] += events[pixel, column] * np.log(of_bin)
+                column += 1
+            wanted[pixel] += silent[pixel, number] * np.log(1 - chance.sum(axis=0))
+    np.testing.assert_allclose(found, wanted)
+    values = np.full(9, 0.4)
+    values[likelihood.THETA[1]], values[likelihood.MISMATCH[1]] = 0.22, 0.17
+    spread = np.hypot(0.17, 0.05 / 0.22)  # no narrower than a step of the grid
+    prior = np.exp(-0.5 * ((grid / 0.22 - 1) / spread) ** 2)
+    fit = trials_fit.Fit("sqrt", values, None, None, None, SimpleNamespace(grids=(None, grid)), 0.0)
+    posterior = np.exp(wanted - wanted.max(axis=1, keepdims=True)) * prior
+    np.testing.assert_allclose(fit.law_given(counts), posterior / posterior.sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(fit.law_of_thresholds(1), prior / prior.sum())
+
+
+def test_sums_of_steps_give_the_variance_of_totals_and_the_noise_in_the_width(monkeypatch):
+    """Of good pixels, but for a group; the noise is what both widths have beyond the spread of their thresholds."""
+    rng, shape, trials = np.random.default_rng(7), (12, 15), 300
+    group, good = rng.integers(0, GROUPS, shape), rng.random(shape) < 0.8
+    totals = {"on_total": rng.integers(200, 400, shape), "off_total": rng.integers(100, 500, shape)}
+    pixels = np.bincount(group[good], minlength=GROUPS).astype(float)
+    on, off = rng.uniform(5, 60, (2, 4, GROUPS))
+    steps = SimpleNamespace(on=on, off=off, pixels=pixels, group=group, **totals)
+    step, asked = np.array([-0.3, -0.1, 0.2, 0.4]), []
+    monkeypatch.setattr(
+        thresholds, "_fit_curves", lambda *given: asked.append(given) or np.array([0.2, 0.3, 0.1, 0.15])
+    )
+    monkeypatch.setattr(thresholds, "_mismatch_square", lambda *given: asked.append(given) or 0.02 * len(asked))
+    sums = thresholds._Sums.of(steps, good)
+    for one, left in ((sums, good), (sums.without(3), good & (group != 3))):
+        asked.clear()
+        found = one.fit(step, trials, None)
+        keep = np.arange(GROUPS) != 3 if one is not sums else np.ones(GROUPS, bool)
+        rates, at, count, start = asked[0]
+        assert at is step and count == left.sum() * trials and start is None
+        np.testing.assert_allclose(rates, [each[:, keep].sum(axis=1) / count for each in (on, off)])
+        for k, (sign, name) in enumerate(((1, "on_total"), (-1, "off_total"))):
+            theta, width, slope, signed, variance, number = asked[1 + k]
+            assert (theta, width, slope, number) == ((0.2, 0.3)[k], 0.1, sign * 0.15, trials)
+            np.testing.assert_array_equal(signed, sign * step)
+            assert variance == pytest.approx(totals[name][left].var(ddof=1))
+        noise = np.sqrt(((0.1 * 1.15) ** 2 - 0.04 * 0.2**2 + (0.1 * 0.85) ** 2 - 0.06 * 0.3**2) / 2)
+        np.testing.assert_allclose(found, [0.2, 0.3, 0.1, 0.15, 0.04, 0.06, noise])
+
+
+@pytest.mark.parametrize("squares", [(0.012, 0.03), (0.0005, 0.03), (0.0002, 0.0003)])
+def test_a_mismatch_counts_beyond_errors_of_both_polarities_together(monkeypatch, squares):
+    """Jackknife over the groups that have pixels: (n − 1)/n Σ of squares; each polarity where both together show."""
+    rng = np.random.default_rng(3)
+    values = np.array([0.2, 0.3, 0.1, 0.05, *squares, 0.07])
+    left = values + rng.normal(size=(GROUPS, 7)) * [3e-3, 4e-3, 1e-3, 2e-3, 2e-4, 6e-4, 5e-4]
+    pixels = np.where(np.arange(GROUPS) == 5, 0.0, 30.0)
+
+    def of(steps, good):
+        return SimpleNamespace(
+            pixels=pixels, fit=lambda step, trials: values,
+            without=lambda k: SimpleNamespace(fit=lambda step, trials, start: left[k]),
+        )  # fmt: skip
+
+    def of_pixel(start, sign, signed, total, trials, m):
+        return (np.array([sign * signed[0], m]), total)
+
+    monkeypatch.setattr(thresholds, "_Sums", SimpleNamespace(of=of))
+    monkeypatch.setattr(thresholds, "_of_pixel", of_pixel)
+    steps = SimpleNamespace(trials=40, on_total="on", off_total="off")
+    found = thresholds.fit_thresholds(steps, np.array([0.4, 0.5]), None)
+    kept = left[pixels > 0]
+    n = len(kept)
+    covariance = (n - 1) / n * (kept - kept.mean(axis=0)).T @ (kept - kept.mean(axis=0))
+    error = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found.covariance, covariance[:4, :4])
+    assert found.theta == pytest.approx(0.25)
+    assert found.theta_error == pytest.approx(np.sqrt([0.5, 0.5] @ covariance[:2, :2] @ [0.5, 0.5]))
+    both, both_error = np.mean(squares), np.sqrt([0.5, 0.5] @ covariance[4:6, 4:6] @ [0.5, 0.5])
+    shows = both > thresholds._SIGMAS * both_error
+    assert shows == (squares[1] > 0.01)
+    own = [np.sqrt(v) if shows and v > thresholds._SIGMAS * e else 0 for v, e in zip(squares, error[4:6], strict=True)]
+    assert (own[0] > 0) == (squares[0] > 0.01)
+    assert (found.mismatch_on, found.mismatch_off) == pytest.approx(own)
+    assert found.spread.value == pytest.approx(np.sqrt(both) if shows else 0)
+    assert found.spread.error == pytest.approx(both_error / (2 * np.sqrt(both)) if shows else np.nan, nan_ok=True)
+    assert found.spread.limit == pytest.approx(np.sqrt(both + 2 * both_error)) and found.spread.groups == GROUPS
+    assert found.noise == pytest.approx((0.07, error[6]))
+    np.testing.assert_allclose([found.pixel_on, found.pixel_off], [[0.4, own[0]], [0.4, own[1]]])
+    assert (found.noise_on, found.noise_off) == ("on", "off")
+
+
+def test_first_events_are_means_over_the_noise_at_the_reset():
+    """A trapezoid rule over that noise. Calm trials count by their chance to be so while settling, but for the first
+    0.15 of a period, in which the noise stays. What lies beyond a threshold after the step passes with it.
+    """
+    theta, other, step, cutoff, settle, leak = 0.3, 0.36, 0.11, 40.0, 0.009, (2.0, 3.0)
+    before, after, edges = 0.17, 0.2, np.array([0.0, 0.004, 0.02])
+    z = np.linspace(-8, 8, 4001)
+    h = 2 * np.pi * cutoff * settle / np.sqrt(np.sqrt(2) - 1)
+    rho = (1 + h) * np.exp(-h)
+    fresh = np.sqrt(1 - rho**2)
+
+    def rate(level):
+        return cutoff * likelihood.passage_rate(level)
+
+    high, low = theta / before + z, other / before - z
+    weight = norm.pdf(z) * np.exp(-(rate(high) + rate(low) + 5.0) * (settle - 0.15 / cutoff))
+    up, down = (theta - step + before * z) / after, (other + step - before * z) / after
+    calm = norm.cdf(high, rho * z, fresh) - norm.cdf(-low, rho * z, fresh)
+    first = np.maximum(norm.cdf(high, rho * z, fresh) - norm.cdf(up, rho * z, fresh), 0) / calm
+    first_other = np.maximum(norm.cdf(-down, rho * z, fresh) - norm.cdf(-low, rho * z, fresh), 0) / calm
+    own, others = rate(up) + leak[0], rate(down) + leak[1]
+    found = likelihood.first_event(theta, other, step, (before, after), cutoff, settle, edges, leak)
+    for k, (at_once, mine) in enumerate(((first, own), (first_other, others))):
+        for j in range(2):
+            left = (1 - first - first_other) * (
+                np.exp(-(own + others) * edges[j]) - np.exp(-(own + others) * edges[j + 1])
+            )
+            chance = (at_once if j == 0 else 0.0) + left * mine / (own + others)
+            assert found[k][j] == pytest.approx(np.sum(weight * chance) / weight.sum(), rel=2e-3)

@@ -389,6 +389,134 @@ def test_signals_at_event_pixels_are_those_of_their_filter_around():
     assert uneven[3:11, 27].all() and not uneven[3:11, 3:24:3].any() and not uneven[:, 2::3].any()
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_event_pixels_far_from_their_filter_see_it_through_a_wider_gaussian(monkeypatch, turned):
+    """Four pixels from the nearest one, at 1.7 times its signal, in a tile of nine by one."""
+    tile = list("aeeeEeeee") if turned else ["aeeeEeeee"]
+    place = (4, 0) if turned else (0, 4)
+    sensor = SimpleNamespace(
+        tile_rows=tile, evs_grid=SimpleNamespace(rows_per_tile=1, cols_per_tile=1), positions=lambda role: [place],
+        pixels={"E": SimpleNamespace(filter="white", roles=["evs"])},
+    )  # fmt: skip
+    monkeypatch.setattr(composite, "_like_it", lambda *_: {(0, 0): 1.7})
+    rate = np.full((36, 3) if turned else (3, 36), 300.0, np.float32)
+    signal, uneven = composite.signal_at_event_pixels(composite.Composite(rate, 0 * rate), sensor)
+    assert signal.shape == ((4, 3) if turned else (3, 4)) and not uneven.any()
+    np.testing.assert_allclose(signal, 510, rtol=1e-5)
+
+
+@pytest.mark.parametrize("part", [0.98, 1.02])
+def test_a_scene_is_uneven_beyond_a_tenth_and_the_square_root_of_three_times_its_noise(part):
+    """A chequered scene, whose mean over a Gaussian is even: its squared contrast against 0.1² + 3 · 0.05²."""
+    contrast = part * np.sqrt(0.1**2 + 3 * 0.05**2)
+    values = 40 * (1 + contrast * (-1.0) ** np.add.outer(np.arange(24), np.arange(24)))
+    mean, uneven = composite._smoothed(values, np.full(values.shape, 2.0), 1.0, 1.0)
+    np.testing.assert_allclose(mean[5:-5, 5:-5], 40, rtol=1e-3)
+    assert (uneven[5:-5, 5:-5] == (part > 1)).all()
+
+
+def test_values_between_two_levels_belong_to_both_by_their_chance():
+    """Least squares of 4 × 7 values, each twice, once a level, with its chance as weight."""
+    rng = np.random.default_rng(8)
+    t, high = np.array([0.2, 0.35, 0.6, 1.0])[:, None, None], rng.random((4, 7, 3))
+    y = rng.normal(70, 9, (4, 7, 3))
+    found, width = telegraph._line(y, np.broadcast_to(t, y.shape), high)
+    plain, plain_width = telegraph._line(y, np.broadcast_to(t, y.shape), None)
+    for pixel in range(3):
+        times = np.broadcast_to(t[..., 0], (4, 7)).ravel()
+        design = np.stack([np.ones(56), np.tile(times, 2), np.repeat([0.0, 1.0], 28)], axis=1)
+        chance, values = high[..., pixel].ravel(), np.tile(y[..., pixel].ravel(), 2)
+        root = np.sqrt(np.concatenate([1 - chance, chance]))
+        line = np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
+        np.testing.assert_allclose(found[:, pixel], line, rtol=1e-5)
+        assert width[pixel] == pytest.approx(np.sqrt(np.sum((root * (values - design @ line)) ** 2) / 28), rel=1e-5)
+        line = np.polyfit(times, values[:28], 1)
+        np.testing.assert_allclose(plain[:, pixel], line[::-1], rtol=1e-5)
+        assert plain_width[pixel] == pytest.approx(np.std(values[:28] - np.polyval(line, times)), rel=1e-5)
+
+
+def test_a_chain_has_the_share_and_the_correlation_of_its_states(monkeypatch):
+    """P(high, high) = p² + p (1 − p) c; the search ends where the likelihood rises no more, or after its rounds."""
+    rng, rounds = np.random.default_rng(2), []
+    y, high = rng.normal(40, 3, (2, 6, 3)), rng.uniform(0.1, 0.6, (2, 6, 3))
+    high[..., 2] = 1.0  # never low: share and correlation stay 1e-4 below 1
+    share = high.mean(axis=(0, 1))
+    both = share**2 + share * (1 - share) * np.array([0.37, 0.81, 0.0])
+    share[2], stay = 0.9999, [0.37, 0.81, 0.9999]
+
+    def chain(y, t, level, width, share, correlation):
+        rounds.append((share, correlation))
+        return np.full(3, [-50.0, -40.0, -40.0][len(rounds) - 1]), high, both
+
+    monkeypatch.setattr(telegraph, "_chain", chain)
+    found = telegraph._climb(y, np.array([0.4, 1.0])[:, None, None], y > 40)
+    assert len(rounds) == 3
+    np.testing.assert_allclose(rounds[0], 0.5)
+    for one in (rounds[1], rounds[2], found[2:4]):
+        np.testing.assert_allclose(one, [share, stay])
+    np.testing.assert_allclose(found[0], telegraph._line(y, np.broadcast_to([[[0.4]], [[1.0]]], y.shape), high)[0])
+    assert found[4].tolist() == [-40, -40, -40]
+
+
+def test_the_likelier_of_two_fits_counts_and_its_higher_level(monkeypatch):
+    """Of states above the line, and above the median; the gain is over a line with one normal law."""
+    rng, begun = np.random.default_rng(4), []
+    times, y = np.array([0.3, 0.7, 1.2]), rng.normal(50, 4, (3, 5, 2)) + 30 * np.array([0.3, 0.7, 1.2])[:, None, None]
+
+    def climb(y, t, begin):
+        np.testing.assert_allclose(t.ravel(), times / 1.2)
+        begun.append(begin)
+        k = len(begun)
+        level = np.array([[50.0, 51], [30, 31], [6.0 * k, -7.0 * k]])
+        return level, np.array([2.0, 3.0]) * k, np.array([0.2, 0.3]) / k, np.array([0.6, 0.5]), np.array([-9.0, -8 - k])
+
+    monkeypatch.setattr(telegraph, "_climb", climb)
+    found = telegraph.fit_two_levels(y, times)
+    for pixel in range(2):
+        line = np.polyfit(np.repeat(times, 5), y[..., pixel].ravel(), 1)
+        rest = y[..., pixel] - np.polyval(line, times)[:, None]
+        np.testing.assert_array_equal(begun[0][..., pixel], rest > 0)
+        one = norm.logpdf(rest, scale=rest.std()).sum()
+        assert found.gain[pixel] == pytest.approx([-9.0, -9.0][pixel] - one, rel=1e-5)
+    np.testing.assert_array_equal(begun[1], y > np.median(y, axis=1)[:, None])
+    assert found.amplitude_dn.tolist() == [6, 7] and found.width_dn.tolist() == [2, 3]
+    np.testing.assert_allclose(found.high_share, [0.2, 0.7])
+    np.testing.assert_allclose(found.visits, 15 * np.array([0.2, 0.3]))
+    begun.clear()
+    monkeypatch.setattr(telegraph, "_climb", lambda *given: (*climb(*given)[:4], np.full(2, -9.0 + len(begun))))
+    assert telegraph.fit_two_levels(y, times).amplitude_dn.tolist() == [12, 14]
+
+
+def test_pixels_have_two_levels_by_gain_visits_and_distance():
+    plain = {"amplitude_dn": 12.0, "high_share": 0.3, "correlation": 0.5, "width_dn": 2.0}
+    least = {"gain": telegraph._LEAST_GAIN, "visits": telegraph._LEAST_VISITS}
+    far = {"amplitude_dn": telegraph._LEAST_DISTANCE * 2.0}
+    for changed, is_one in (
+        ({"gain": 1.01 * least["gain"]}, True), ({"gain": 0.99 * least["gain"]}, False),
+        ({"visits": least["visits"]}, True), ({"visits": 0.99 * least["visits"]}, False),
+        ({"amplitude_dn": 1.01 * far["amplitude_dn"]}, True), ({"amplitude_dn": 0.99 * far["amplitude_dn"]}, False),
+    ):  # fmt: skip
+        values = {**plain, "gain": 2 * least["gain"], "visits": 3 * least["visits"], **changed}
+        one = telegraph.TwoLevels(**{name: np.array([value]) for name, value in values.items()})
+        assert one.is_telegraph.tolist() == [is_one]
+
+
+def test_rows_lose_their_own_noise_or_the_usual_one_where_nearly_all_is_clipped(monkeypatch):
+    """What the clear pixels of a row show, over the square of their share, and what the frame's mean took of it."""
+    change = np.array([[3.0, -1.0, 2.0], [-2.0, 4.0, -1.0], [-1.0, -3.0, -1.0]])
+    own = np.array([0.3, 0.5, 0.2])
+    monkeypatch.setattr(common_mode, "_row_changes", lambda *_: (change, own))
+    lowest, highest = np.full((1, 3, 10), 40), np.full((1, 3, 10), 60)
+    lowest[0, 0, :4], highest[0, 2, 1:] = 255, 0
+    kept = np.full((1, 3, 10), 9.0, np.float32)
+    given = moments.FrameMoments(np.array([700]), 3, kept, kept, lowest, highest, kept, change[None], kept, kept, kept)
+    found = common_mode.without_rows(given, np.ones((3, 10), bool), 255, 4.2).variance[0]
+    of_rows = np.sum(change**2, axis=0) / 2 - own
+    np.testing.assert_allclose(found[0, 4:], 9 - of_rows[0] / 0.6**2 - 1.4, rtol=1e-6)
+    np.testing.assert_allclose(found[1], 9 - of_rows[1] - 1.4, rtol=1e-6)
+    assert found[2, 0] == pytest.approx(9 - 4.2) and (found[0, :4] == 9).all() and (found[2, 1:] == 9).all()
+
+
 def test_pixels_are_unlike_their_kind_by_the_scatter_of_their_variances():
     """Σ (n − 1)(s²/σ² − 1) over what is clear, over √(2 Σ (n − 1)): eight robust widths decide, or eight errors."""
     rng, shape = np.random.default_rng(6), (14, 18)

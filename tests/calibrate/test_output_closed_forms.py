@@ -14,7 +14,9 @@ from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal
 from hesim_render.calibrate.asynchronous import likelihood
 from hesim_render.calibrate.asynchronous import output as trials_output
+from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.calibration import sensor_values
+from hesim_render.calibration.spec import Defect
 from hesim_render.core.errors import SpecError
 
 #: Half of an interval of 95 % of a normal law, errors.
@@ -102,6 +104,54 @@ def test_noise_below_a_grey_value_is_that_of_the_long_series_less_what_else_it_h
         assert (found["value"] is None) == (limit is not None)
         if limit is not None:
             assert found["upper_limit"] == pytest.approx(limit / K) and f"at most {limit:.2g} DN" in found["reason"]
+
+
+@pytest.mark.parametrize("is_rounded", [False, True])
+def test_maps_of_emva_captures_are_their_patterns_without_rows_and_shading(monkeypatch, is_rounded):
+    """Pixels that are white or black are moved by the whole range; the figure's points have neither rounding nor
+    lines, and those that are not clear have no light.
+    """
+    rng, shape = np.random.default_rng(3), (4, 5)
+    row, col, pixel = rng.normal(2, 1, 4), rng.normal(0.7, 0.3, 5), rng.normal(0, 3, shape)
+    shade, whole = rng.uniform(-0.2, 0.2, shape), rng.uniform(-0.3, 0.3, shape)
+    whole[3, 3] = -1.4
+    white, black = np.zeros((2, *shape), bool)
+    white[1, 2] = black[0, 4] = True
+    levels, t = rng.normal(9, 1, shape), np.array([0.01, 0.013, 0.05])
+    monkeypatch.setattr(pairs_output, "stuck_pixels", lambda full, *_: (white, black) if full == 1023 else None)
+    monkeypatch.setattr(pairs_output, "levels_of", lambda mean, good, spread: levels * spread * mean * good)
+    monkeypatch.setattr(pairs_output, "_histogram", lambda result, series, signal: (series.name, signal))
+    monkeypatch.setattr(pairs_output, "_FIGURE_PX", 2)
+    lit = SimpleNamespace(mean=np.array([40.0, 90, 300]), variance=np.array([5.0, 8, 19]), exposure_s=t)
+    dark = SimpleNamespace(mean=np.array([10.0, 11, 12]), variance=np.array([3.0, 3.2, 3.4]), exposure_s=t)
+    result = SimpleNamespace(
+        pairs=SimpleNamespace(
+            shape=shape, spec=SimpleNamespace(full_scale_dn=1023), spatial_lit=SimpleNamespace(exposure_s=0.02)
+        ),
+        light_pattern=SimpleNamespace(shading=lambda: shade, whole=whole),
+        dark_pattern=SimpleNamespace(row=row, col=col, pixel=pixel),
+        rounded_noise=SimpleNamespace(spread=0.3) if is_rounded else None, defects=np.zeros(shape, bool),
+        long_dark=SimpleNamespace(name="dark", mean=np.full(shape, 1.7)), lit=lit, dark=dark, lines_dn2=0.4,
+        long_lit=SimpleNamespace(name="lit", mean=np.full(shape, 150.0), variance=rng.random(shape)),
+        clear=np.array([True, True, False]), signal=lit.mean - dark.mean, black=SimpleNamespace(slope=7.0, value=9.5),
+    )  # fmt: skip
+    found = pairs_output.maps(result)
+    offset = levels * 0.3 * 1.7 - row[:, None] if is_rounded else col + pixel
+    offset[1, 2], offset[0, 4] = offset[1, 2] + 1023, offset[0, 4] - 1023
+    response = (1 + whole) / (1 + shade)
+    response[0, 4] = response[3, 3] = 0
+    np.testing.assert_allclose(found["n_blc"], offset, rtol=1e-5)
+    np.testing.assert_allclose(found["response"], response, rtol=1e-6)
+    np.testing.assert_allclose(found["light_rel"], 1 + shade, rtol=1e-6)
+    assert (found["n_dp"] == 7).all() and found["n_row"] is row
+    assert found["figure_variance_map"].tolist() == result.long_lit.variance[::3, ::3].tolist()
+    assert found["figure_variance_exposure_us"] == pytest.approx(20_000)
+    assert (found["figure_noise_dark"], found["figure_noise_lit"]) == (("dark", 0.0), ("lit", 140.5))
+    known = [(0, 3.0), (0, 3.2), (0, 3.4), (30, 5.0), (79, 8.0)]
+    points = [(0, 0, 0.013, k > 2, x, v - 1 / 12 - 0.4, 20) for k, (x, v) in enumerate(known)]
+    np.testing.assert_allclose(found["figure_variance_points"], points)
+    result.black.slope = -2.0
+    assert not pairs_output.maps(result)["n_dp"].any()
 
 
 def test_efficiency_dark_current_and_full_well_of_emva_captures():
@@ -319,7 +369,10 @@ def test_histograms_of_noise_are_densities_beside_that_of_their_law():
         np.testing.assert_allclose(place, -place[::-1], atol=1e-9)
         exact = (norm.cdf((place + width / 2) / sigma) - norm.cdf((place - width / 2) / sigma)) / width
         np.testing.assert_allclose(predicted, exact, rtol=1e-6, atol=1e-12)
-        # 20,000 values: 4.5 binomial errors of each bin
+        # a value deviates less from a mean that it is in; of the law there are 4.5 binomial errors of each bin
+        edges = np.append(place - width / 2, place[-1] + width / 2)
+        own = np.histogram((stack[0] - stack.mean(axis=0)) * np.sqrt(5 / 4), edges)[0] / (20_000 * width)
+        np.testing.assert_allclose(counted, own, atol=2.1 / (20_000 * width))
         np.testing.assert_allclose(counted, exact, atol=4.5 * np.sqrt(exact.max() / width / 20_000))
         assert counted.sum() * width == pytest.approx(1, abs=2e-4)
 
@@ -355,6 +408,100 @@ def test_beta_and_noise_of_trials_have_errors_of_the_delta_method(law, power):
     fit.free = np.isin(np.arange(len(names)), (of.SHOT, 0))
     assert of._noise(fit, light)["standard_error"] == pytest.approx(sizes[of.SHOT] * slope[of.SHOT], rel=1e-3)
     assert of._beta(fit)[0][4] == 0.0 and of._beta(fit)[1][4] is None
+
+
+def test_figures_of_trials_are_sums_over_pixels_beside_the_mean_chance(monkeypatch):
+    """Three kinds of steps, two up and one down, with two time bins; chances differ by kind, bin and threshold."""
+    rng, sizes = np.random.default_rng(9), (3, 2, 5)
+    steps = Trials(
+        np.array([40.0, 70.0, 40.0]), np.array([0.3, 0.2, -0.4]), 1e-3, np.array([0.0, 2e-3, 7e-3]),
+        rng.integers(60, 90, (3, 5)), rng.integers(0, 9, sizes), rng.integers(0, 9, sizes), (1, 5),
+    )  # fmt: skip
+    steady = Trials(
+        np.array([11.0, 80.0]), np.zeros(2), 1e-3, np.array([0.0, 0.013]), rng.integers(60, 90, (2, 5)),
+        rng.integers(0, 9, (2, 1, 5)), rng.integers(0, 9, (2, 1, 5)), (1, 5),
+    )  # fmt: skip
+    laws = {1: np.array([0.2, 0.5, 0.3]), -1: np.array([0.1, 0.2, 0.7])}
+
+    def chance(signal, contrast, bin_, polarity, threshold):
+        return 1e-3 * (signal + 20 * abs(contrast)) * (1 + 2 * bin_) * threshold * (1.5 if polarity < 0 else 1)
+
+    def chances(values, there, polarity, grid, law):
+        assert (values, law) == ("values", "sqrt")
+        bins = range(there.edges_s.size - 1)
+        return np.array([[[chance(s, c, j, polarity, v) for v in grid] for j in bins]
+                         for s, c in zip(there.signal_dn, there.contrast, strict=True)])  # fmt: skip
+
+    monkeypatch.setattr(trials_output, "chances", chances)
+    monkeypatch.setattr(trials_output, "step_of", lambda values, there: 0.9 * there.contrast)
+    grids = np.array([1.0, 2.0, 4.0]), np.array([1.5, 2.5, 3.0])
+    fit = SimpleNamespace(
+        values="values", law="sqrt", likelihood=SimpleNamespace(grids=grids),
+        law_of_thresholds=lambda k: laws[1 - 2 * k],
+    )  # fmt: skip
+    figures = trials_output._figures(fit, steady, steps)
+    wanted = []
+    for polarity, kinds, grid in ((1, (0, 1), grids[0]), (-1, (2,), grids[1])):
+        for j in range(2):
+            for kind in kinds:
+                signal, contrast = steps.signal_dn[kind], steps.contrast[kind]
+                events = (steps.on if polarity > 0 else steps.off)[kind, : j + 1].sum()
+                mean = sum(
+                    w * chance(signal, contrast, b, polarity, v)
+                    for b in range(j + 1)
+                    for v, w in zip(grid, laws[polarity], strict=True)
+                )
+                wanted.append([polarity, signal, 0.9 * contrast, j, events, steps.calm[kind].sum(), mean])
+    np.testing.assert_allclose(figures["figure_s_curves"], wanted)
+    rates = [
+        [signal, steady.on[k].sum(), steady.off[k].sum(), steady.calm[k].sum() * 0.013,
+         *(chance(signal, 0, 0, p, grid) @ laws[p] / 0.013 for p, grid in zip((1, -1), grids, strict=True))]
+        for k, signal in enumerate(steady.signal_dn)
+    ]  # fmt: skip
+    np.testing.assert_allclose(figures["figure_noise_rate"], rates)
+
+
+def test_the_section_of_trials_has_the_mean_threshold_and_the_chances_of_its_families(monkeypatch):
+    """Thresholds are correlated; maps of ON and OFF are those of their polarity."""
+    names = trials_output.NAMES
+    values, covariance = 0.1 + 0.03 * np.arange(9), np.diag(np.arange(1.0, 10) ** 2 * 1e-6)
+    covariance[0, 1] = covariance[1, 0] = 0.7e-6
+    free = np.arange(9) != likelihood.LEAK
+    fit = SimpleNamespace(
+        values=values, covariance=covariance, law="sqrt", free=free, value=lambda name: values[names.index(name)],
+        error=lambda name: np.sqrt(covariance[names.index(name), names.index(name)]),
+    )  # fmt: skip
+    families = {"steps": 0.31, "times": 0.42, "steady": 0.53}
+    goodness = {name: SimpleNamespace(chi2=50.0, dof=10, p_value=p) for name, p in families.items()}
+    goodness["all"] = SimpleNamespace(chi2=90.0, dof=36, p_value=0.07)
+    light, shape = SimpleNamespace(signal_dn=np.array([30.0, 7.0]), shape=(2, 3), of=lambda good: good), (2, 3)
+    ones = np.arange(6.0)
+    result = SimpleNamespace(
+        fit=fit, advantage=5.1, goodness=goodness, findings=[], mismatch=SimpleNamespace(described=dict), steady=light,
+        steps=light, fitted=np.arange(5), relative=(ones, ones + 10), noise=(ones + 20, ones + 30),
+        defects=SimpleNamespace(
+            bad=ones == 2, kind=np.where(ones == 2, Defect.HOT, 0).astype(np.uint8), on_hz=ones, off_hz=ones,
+            firing_share=ones, change_hz=ones,
+        ),
+    )  # fmt: skip
+    found = trials_output.content(result)
+    check(found["theta"], 0.115, np.sqrt(1e-6 + 4e-6 + 1.4e-6) / 2, "ln")
+    check(found["theta_off"], 0.13, 2e-3, "ln")
+    assert (
+        found["shot_law_decisive"]
+        and not trials_output.content(SimpleNamespace(**{**vars(result), "advantage": -4.9}))["shot_law_decisive"]
+    )
+    assert found["leak_rate_hz"]["value"] == 0 and [each["signal_dn"] for each in found["noise"]] == [7, 30]
+    chances = {f"{name}_p_value": p for name, p in families.items()}
+    assert found["goodness"] == {"chi2_per_dof": 2.5, "dof": 36, "p_value": 0.07, **chances}
+    assert (found["fitted_pixels"], found["bad_pixels"], found["defects"]["hot"]) == (5, 1, 1)
+    monkeypatch.setattr(trials_output, "_figures", lambda fit, steady, steps: {"good": steady & steps})
+    maps = trials_output.maps(result)
+    assert maps.pop("good").tolist() == (ones != 2).tolist()
+    wanted = {"threshold_on_rel": 0, "threshold_off_rel": 10, "threshold_on_noise": 20, "threshold_off_noise": 30}
+    for name, offset in wanted.items():
+        np.testing.assert_array_equal(maps[name], (ones + offset).reshape(shape))
+    assert maps["bad_pixels"].shape == shape and maps["bad_pixels"][0, 2] and maps["bad_pixels"].sum() == 1
 
 
 ENTRY = SimpleNamespace(error=SpecError)

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.stats import chi2 as chi2_law
+from scipy.stats import f as f_law
 from scipy.stats import gamma
 
 from hesim_render.calibrate.aps import light_curve, noise_spectrum, pairs, spatial
 from hesim_render.calibrate.aps.light_curve import require_steady_light
-from hesim_render.calibrate.aps.pair_levels import Levels, pair_statistics
+from hesim_render.calibrate.aps.pair_levels import Levels, SpatialStack, pair_statistics
 from hesim_render.core.errors import SpecError
 
 X = np.array([1.0, 2.5, 4.0, 7.0, 11.0])
@@ -101,6 +102,38 @@ def test_the_mean_curve_has_its_terms_in_units_of_light():
     # light that scatters by 0.3 % in its brighter half
     rough = signal * (1 + 3e-3 * np.where(np.arange(24) % 2 == 0, 1, -1))
     assert light_curve.mean_curve(light, rough, error).light_rms == pytest.approx(3e-3, rel=0.2)
+
+
+@pytest.mark.parametrize("power", [2, 3])
+@pytest.mark.parametrize("part", [0.5, 2.0])
+def test_a_bend_counts_where_the_f_test_finds_it(power, part):
+    """A bend whose chance is half the level of the test, or twice as large, and scatter that no other term tells."""
+    light = np.linspace(20, 900, 9)
+    h = light / light.max()
+    basis = np.linalg.qr(np.stack([h, h**power, h**0, h ** (5 - power)], axis=1), mode="complete")[0]
+    bend, rest = basis[:, 1], basis[:, 4:] @ [0.5, -0.3, 0.7, 0.2, -0.6]
+    f = f_law.isf(part * light_curve.ALARM, 1, 7)
+    signal = 40 * h + bend * np.sqrt(f * rest @ rest / 7) + rest
+    found = light_curve.mean_curve(light, signal, np.full(9, 8.0))
+    assert (found.terms[power - 1] != 0) == (part < 1)
+    assert found.terms[3 - power + 1] == 0 and found.offset == 0
+
+
+def test_a_long_series_is_read_as_a_stack_of_one_exposure():
+    told = []
+    series = SimpleNamespace(where="list", files=["a", "b", "c"], exposure_s=0.0123457)
+    set_of_pairs = SimpleNamespace(shape=(2, 5), frames=lambda one: iter(one.files))
+    stack = SpatialStack(set_of_pairs, series, lambda what, part: told.append(part))
+    assert list(stack) == ["a", "b", "c"] and told == pytest.approx([1 / 3, 2 / 3, 1])
+    assert stack.shape == (1, 3, 2, 5) and stack.exposures_us.tolist() == [12346]
+
+
+@pytest.mark.parametrize(("saturation", "top"), [(1, 20.0), (3, 45.0)])
+def test_the_signal_at_saturation_is_that_of_its_level_or_the_last(saturation, top):
+    result = SimpleNamespace(signal=np.array([7.0, 20.0, 45.0]), saturation=saturation)
+    assert pairs.PairCalibration.top_dn.fget(result) == top
+    result.lit, result.black = SimpleNamespace(mean=np.array([30.0, 71.0, 64.0])), SimpleNamespace(value=9.5)
+    assert pairs.PairCalibration.brightest_dn.fget(result) == 61.5
 
 
 def test_statistics_of_a_pair_are_those_of_its_definition():

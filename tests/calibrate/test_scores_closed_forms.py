@@ -142,6 +142,21 @@ def test_one_law_is_likelier_by_the_scatter_of_the_counts():
     assert analysis._likelier({"sqrt": one_fit()}) == "sqrt"
 
 
+def test_medians_tell_a_law_by_the_lead_over_the_smaller_scatter(monkeypatch):
+    """Both laws are fitted unless the lead leaves no doubt."""
+    starts = {"linear": ("a", -500.0, 4.0), "sqrt": ("b", -440.0, 5.0)}
+    monkeypatch.setattr(analysis, "Typical", SimpleNamespace(of=lambda *_: SimpleNamespace(cells="cells")))
+    monkeypatch.setattr(analysis, "best_start", lambda cells, theta_v, law: starts[law])
+    begun = analysis._Begun.of(None, None, 0.7)
+    assert begun.lead == pytest.approx(15) and begun.starts == {"linear": "a", "sqrt": "b"} and begun.theta_v == 0.7
+    sure, doubt = analysis.DECISIVE, analysis._BEYOND_DOUBT
+    for lead, law in ((1.01 * sure, "sqrt"), (0.99 * sure, "linear"), (-1.01 * sure, "linear")):
+        assert begun._replace(lead=lead).law == law
+    for lead, wanted in ((0.99 * doubt, 2), (1.01 * doubt, ("sqrt",)), (-1.01 * doubt, ("linear",))):
+        found = begun._replace(lead=lead).wanted
+        assert found == wanted or len(found) == wanted
+
+
 def test_brightness_and_events_that_tell_nothing_are_refused(tmp_path):
     captures, good = SimpleNamespace(folder=tmp_path), np.ones((3, 4), bool)
 
@@ -176,7 +191,7 @@ def test_of_two_parameters_the_one_goes_without_which_the_fit_is_better(monkeypa
     assert asked == 2 * [[False, False, True, True, True, True], [True, False, False, True, True, True]]
 
 
-@pytest.mark.parametrize("more", [0.98, 1.02])
+@pytest.mark.parametrize("more", [0.998, 1.002])
 def test_a_pixel_is_unsteady_beyond_a_tail_of_1e_6(more):
     """χ² of 20 parts about a rate, its deviation from 19 divided by √(1 + 1/(2 mean)); ten events are needed."""
     limit = 19 + (chi2.isf(1e-6, 19) - 19) * np.sqrt(1 + 1 / (2 * 30.0))
@@ -277,3 +292,56 @@ def test_a_ceiling_below_1_is_told_beyond_its_error(value, error, is_told):
     assert (found is not None) is is_told
     if is_told:
         assert found.p_value == pytest.approx(norm.sf(0.02 / error), rel=1e-6, abs=0)
+
+
+def test_pixels_whose_thresholds_lie_apart_more_than_those_of_others(monkeypatch):
+    """Six spreads of θ₊ − θ₋ without its noise, and six errors of the pixel; beside them those beyond the means."""
+    rng, shape = np.random.default_rng(5), (20, 30)
+    on, off = rng.normal(1, 0.05, shape), rng.normal(1.02, 0.07, shape)
+    noise = rng.uniform(0.01, 0.04, (2, *shape))
+    good = rng.random(shape) < 0.9
+    places = [(3, 4), (3, 5), (11, 20), (11, 21)]
+    for place, away in zip(places, (9.0, 9.0, -9.0, -9.0), strict=True):
+        on[place], good[place] = away, True
+    apart = on - off
+    low, centre, high = np.quantile(apart[good], [0.16, 0.5, 0.84])
+    both = noise[0] ** 2 + noise[1] ** 2
+    spread = np.sqrt((high / 2 - low / 2) ** 2 - np.median(both[good]))
+    assert 0.02 < spread < 0.95 * (high - low) / 2
+    for place, part in zip(places, (0.99, 1.01, 0.99, 1.01), strict=True):
+        limit = part * (6 * spread + 6 * np.sqrt(both[place]))
+        on[place] = off[place] + centre + (limit if place[0] == 3 else -limit)
+    monkeypatch.setattr(defects, "totals_of", lambda thresholds, polarity, ends, trials: (700 + 40 * polarity, 400.0))
+    thresholds = SimpleNamespace(
+        mismatch_on=0.1, mismatch_off=0.1, pixel_on=on, pixel_off=off, noise_on=noise[0], noise_off=noise[1]
+    )
+    steps = SimpleNamespace(on_total=np.full(shape, 600), off_total=np.full(shape, 550), trials=50)
+    found = defects.bad_in_steps(steps, thresholds, good)
+    assert [tuple(place) for place in np.argwhere(found)] == [(3, 5), (11, 21)]
+
+
+def test_static_counts_of_pixels_whose_thresholds_lie_apart():
+    """Of three groups with medians of their own: deviates of the counts' shares, each with its counting error.
+
+    A twentieth of the pixels scatter by up to half of their threshold, about the limit.
+    """
+    rng, pixels, trials = np.random.default_rng(9), 700, 4000
+    group = rng.integers(0, 3, pixels)
+    middle = [np.array([1.4, 1.9, 0.25]), np.array([1.6, 1.7, 0.3])]
+    wide = np.where(rng.random(pixels) < 0.05, rng.uniform(-0.5, 0.5, pixels), 0.03 * rng.standard_normal(pixels))
+    chance = [norm.sf(own[group] * (1 + sign * wide)) for own, sign in zip(middle, (1, -1), strict=True)]
+    both = [rng.binomial(trials, one).astype(float) for one in chance]
+    both[0][:7] = 0  # too few events
+    found = defects._apart(both, group, trials, middle)
+    known = np.flatnonzero((both[0] >= 10) & (both[1] >= 10) & (group < 2))
+    share = (np.stack(both) + 0.5) / (trials + 1)
+    u = (middle[0] + middle[1])[group] / 2
+    deviates = norm.isf(share) - np.stack(middle)[:, group]
+    differ = (deviates[0] - deviates[1]) / u
+    error = np.sum(share * (1 - share) / trials / norm.pdf(norm.isf(share)) ** 2, axis=0) / u**2
+    low, centre, high = np.quantile(differ[known], [0.16, 0.5, 0.84])
+    spread = np.sqrt((high - low) ** 2 / 4 - np.median(error[known]))
+    limit = np.maximum(0.06, 6 * spread) + 6 * np.sqrt(error)
+    expected = np.isin(np.arange(pixels), known) & (np.abs(differ - centre) > limit)
+    assert 6 * spread > 0.06 and 5 < expected.sum() < 40
+    assert found.tolist() == expected.tolist()

@@ -7,11 +7,12 @@ import pytest
 from scipy import stats
 
 from hesim_render.calibrate.estimate import estimated
-from hesim_render.calibrate.recordings import short_intervals, still, target
+from hesim_render.calibrate.recordings import calibration, short_intervals, still, target
 from hesim_render.calibrate.recordings import tally as recording_tally
 from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import readout_limit
-from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, SLICES, EventTally, tally
+from hesim_render.calibrate.recordings.tally import GROUPS, LAMPS_HZ, LONG_US, SLICES, EventTally, tally
+from hesim_render.core.errors import RangeError
 from hesim_render.exchange import EventStream
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
@@ -260,7 +261,7 @@ def test_leaks_without_a_ratio_are_known_where_off_events_hardly_count():
 
 
 def test_a_target_tells_each_pixels_ratio_and_so_its_leak():
-    """Pixels with θ₋/θ₊ of 0.8 to 1.5 and a leak of 3 Hz: counts that balance exactly give it back."""
+    """Pixels with θ₋/θ₊ of 0.8 to 1.5, and leaks of their own in still light: counts that balance exactly."""
     rng = np.random.default_rng(5)
     group = np.arange(PIXELS) % GROUPS
     ratio = rng.uniform(0.8, 1.5, PIXELS)
@@ -269,8 +270,8 @@ def test_a_target_tells_each_pixels_ratio_and_so_its_leak():
         per_pixel=lambda: np.stack([ratio * off + 3.0 * 4.0, off]), seconds=4.0, group=group.astype(np.uint64),
         used=np.ones(PIXELS, bool),
     )  # fmt: skip
-    tallies = []
-    for leak, quiet in ((0.7, 30.0), (1.9, 11.0)):
+    tallies, own = [], np.array([[0.7], [1.9]]) * (1 + 0.4 * rng.standard_normal((2, PIXELS)))
+    for leak, quiet in zip(own, (30.0, 11.0), strict=True):
         count = quiet * rng.uniform(0.5, 1.5, PIXELS)
         both = np.stack([ratio * count + leak * 2.5, count])
         tallies.append(
@@ -281,19 +282,90 @@ def test_a_target_tells_each_pixels_ratio_and_so_its_leak():
         )  # fmt: skip
     found = still.balance_with_target(tallies, [5.0, 80.0], moving, {"value": 1.1}, 3.0)
     assert found.ratio == {"value": 1.1}
-    assert [leak["value"] for leak in found.leaks] == pytest.approx([0.7, 1.9])
+    first, second = own.mean(axis=1)
+    assert [leak["value"] for leak in found.leaks] == pytest.approx([first, second])
     # a tenth of the target's leak is not known: each pixel's ratio is off by 0.1 · 3 · 4 over its OFF events
-    for leak, one in zip(found.leaks, tallies, strict=True):
+    for leak, one, each in zip(found.leaks, tallies, own, strict=True):
         unsure = 0.1 * 12 * np.mean(1 / off) * one.per_pixel()[1].sum() / (PIXELS * 2.5)
-        assert leak["standard_error"] == pytest.approx(unsure)
-    assert found.dark["value"] == pytest.approx(0.7 - 1.2 * 5 / 75)
-    assert found.growth["value"] == pytest.approx(1.2 / 75)
+        without = np.array([each[group != k].mean() for k in range(GROUPS)])
+        scatter = np.sqrt(19 / 20 * np.sum((without - without.mean()) ** 2))
+        assert scatter > 0.05 * unsure and leak["standard_error"] == pytest.approx(np.hypot(unsure, scatter))
+    assert found.dark["value"] == pytest.approx(first - (second - first) * 5 / 75)
+    assert found.growth["value"] == pytest.approx((second - first) / 75)
 
 
 def course():
     """Light that turns without rests, and no leak: nothing but its swing."""
     none = np.zeros(target._PIXELS)
     return target._Course(none, none, (0.0, 0.0), 0.0, np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize("scatters", [True, False])
+def test_errors_of_a_target_go_from_its_moments_through_their_slope(monkeypatch, scatters):
+    """Groups left out, simulated pixels, drift and overshoots, each by its own formula; a spread, or its limit."""
+    rng, pixels, period_s, seconds, rise = np.random.default_rng(12), 200, 0.25, 11.0, 1.3
+    group = rng.permutation(np.arange(pixels) % GROUPS)
+    counts = rng.normal([[320.0], [210.0]], 12.0, (2, pixels))
+    tally = SimpleNamespace(
+        per_pixel=lambda: counts, used=np.ones(pixels, bool), seconds=seconds, group=group.astype(np.uint64),
+        period_s=lambda: period_s,
+    )  # fmt: skip
+    ends, leak_hz, asked = np.array([[0.02, 0.05], [0.07, 0.03]]), 1.7, []
+    over = SimpleNamespace(top=np.array([0.2, 0.4]), bottom=np.array([0.1, 0.25]), unsure=0.08, ends=ends)
+    fitted = np.array([0.21, 0.33, 0.011 if scatters else 0.0003])
+    slope = np.array([[-30.0, 2.0, 0.4], [1.5, -14.0, 0.3], [0.02, 0.01, 0.9]])
+    root = rng.normal(size=(3, 3)) * [[0.03], [0.02], [0.0002]]
+
+    class Simulated:
+        def __init__(self, *given):
+            asked.append(given)
+
+        def fit(self, wanted):
+            asked.append(wanted)
+            return fitted, slope
+
+        def moment_covariance(self, values):
+            assert values is fitted
+            return root @ root.T
+
+    def moments(count):
+        mean = count.mean(axis=1)
+        return np.array([*mean, np.mean(count.var(axis=1, ddof=1) / mean**2)])
+
+    monkeypatch.setattr(target, "_Simulated", Simulated)
+    monkeypatch.setattr(target, "_course", lambda *given: asked.append(given) or over)
+    found = target.thresholds(tally, np.exp(rise), None, leak_hz)
+    ratio = (counts[0].mean() - leak_hz * seconds) / counts[1].mean()
+    assert asked[0][1:] == pytest.approx((leak_hz, period_s, ratio)) and asked[1][:2] == (pytest.approx(rise), 44)
+    a_cycle = counts / 44
+    np.testing.assert_allclose(asked[2], moments(a_cycle))
+    left = [fitted + np.linalg.inv(slope) @ (moments(a_cycle[:, group != k]) - asked[2]) for k in range(GROUPS)]
+    left = np.array(left).T
+
+    def scatter(values):
+        return np.sqrt(19 / 20 * np.sum((values - values.mean(axis=-1, keepdims=True)) ** 2, axis=-1))
+
+    simulated = np.linalg.inv(slope) @ root @ root.T @ np.linalg.inv(slope).T
+    unsure = 0.08 * np.array([1, 1 / ratio]) / a_cycle.mean(axis=1)
+    errors = np.sqrt(scatter(left) ** 2 + np.diag(simulated) + [*(fitted[:2] * unsure) ** 2, 0])
+    beyond = ends @ fitted[:2] / (rise + 0.3 * fitted[0] + 0.175 * fitted[1])
+    for k, name in enumerate(("theta_on", "theta_off")):
+        entry, half = found.entries[name], stats.t.ppf(0.975, 19) * errors[k]
+        low, high = (np.hypot(half, part * fitted[k]) for part in beyond)
+        assert entry["value"] == fitted[k]
+        assert entry["interval_95"] == pytest.approx([fitted[k] - low, fitted[k] + high])
+    entry = found.entries["threshold_mismatch_rel"]
+    assert (fitted[2] > 2 * errors[2]) == scatters
+    if scatters:
+        told = entry["value"], entry["standard_error"]
+        assert told == pytest.approx((np.sqrt(0.011), errors[2] / (2 * np.sqrt(0.011))))
+    else:
+        assert entry["value"] == 0 and entry["upper_limit"] == pytest.approx(np.sqrt(0.0003 + 2 * errors[2]))
+    away = np.array([-1 / fitted[0], 1 / fitted[1], 0])
+    rho = fitted[1] / fitted[0]
+    more = rho**2 * ((unsure[0] + unsure[1]) ** 2 + away @ simulated @ away)
+    assert found.ratio["value"] == pytest.approx(rho)
+    assert found.ratio["standard_error"] == pytest.approx(np.sqrt(scatter(left[1] / left[0]) ** 2 + more))
 
 
 def test_simulated_pixels_count_their_thresholds_in_the_swing():
@@ -517,3 +589,59 @@ def test_a_rate_that_doubles_is_unsteady_beyond_four_errors_of_counting(events, 
         assert f"from {early:.4g} to {late:.4g} Hz a pixel, at most {rate.max():.4g}" in found
     tally.slices[:] = events / 2
     assert still.unsteady(tally) is None
+
+
+def test_the_error_of_a_leak_without_a_ratio_has_the_scatter_of_the_difference():
+    """ON and OFF scatter together, by 3 % and 1 % of ON; OFF events are a thousandth of ON."""
+    rates = np.tile(np.array([[10.0], [0.01]]), GROUPS + 1)
+    rates[:, 1:] += np.array([[3.0], [1.0]]) * np.linspace(-0.1, 0.1, GROUPS)
+    scatter = np.sqrt(19 / 20 * np.sum((2 * np.linspace(-0.1, 0.1, GROUPS)) ** 2))
+    told = still._leak_alone(rates, "why")
+    assert told["standard_error"] == pytest.approx(np.hypot(scatter, 0.75 * 0.01))
+
+
+@pytest.mark.parametrize(("count", "of"), [(7, 23), (0, 40), (31, 31)])
+def test_a_share_has_the_interval_of_a_binomial_count(count, of):
+    told = still.share(count, of)
+    interval = stats.binomtest(count, of).proportion_ci(method="exact")
+    assert told["value"] == count / of and told["interval_95"] == pytest.approx([interval.low, interval.high])
+    assert told["standard_error"] == pytest.approx(stats.binom.std(of, count / of) / of)
+
+
+@pytest.mark.parametrize("periods", [1.95, 2.05])
+def test_a_lamp_is_told_from_slices_of_two_of_its_periods(periods):
+    """All ON events at one phase of the slower lamp."""
+    seconds = periods * SLICES / min(LAMPS_HZ)
+    slices = np.zeros((2, SLICES, GROUPS), int)
+    slices[0] = 50
+    on = slices[0].sum(axis=1)
+    waves = on * np.exp(0.4j) * np.array([[lamp == min(LAMPS_HZ)] for lamp in LAMPS_HZ])
+    told = still.of_a_lamp(SimpleNamespace(slices=slices, seconds=seconds, waves=waves))
+    assert (told is not None) == (periods > 2)
+    if told is not None:
+        assert f"a lamp of {min(LAMPS_HZ):g} Hz" in told
+
+
+@pytest.mark.parametrize(("contrast", "cycles_hz", "is_right"), [
+    (1.001, 0.01, True), (1.0, 3.0, False), (9999.0, None, True), (1e4, None, False), (2.0, 0.0, False),
+    (2.0, -3.0, False), (None, 3.0, False),
+])  # fmt: skip
+def test_a_target_has_a_contrast_above_one_and_cycles(contrast, cycles_hz, is_right):
+    if is_right:
+        calibration._check_target(True, contrast, cycles_hz)
+    else:
+        with pytest.raises(RangeError, match="target_"):
+            calibration._check_target(contrast is not None, contrast, cycles_hz)
+
+
+def test_files_are_read_in_equal_parts_of_the_progress(monkeypatch):
+    parts = []
+    monkeypatch.setattr(calibration, "open_events", lambda name, **_: SimpleNamespace(shape=(3, 4), name=name))
+    monkeypatch.setattr(calibration, "tally", lambda stream: SimpleNamespace(shape=(3, 4), name=stream.name))
+    monkeypatch.setattr(
+        calibration, "figures", lambda tallies, moving, *given: ([t.name for t in tallies], moving.name)
+    )
+    found = calibration.calibrate_recordings(
+        ["a", "b"], lux=[3.0, 8.0], target_file="c", target_contrast=4.0, progress=lambda what, part: parts.append(part)
+    )
+    assert found == (["a", "b"], "c") and parts == pytest.approx([0, 0.25, 0.5, 0.75])

@@ -248,6 +248,19 @@ def test_pixels_are_plainly_bad_by_polarity_calm_and_events_in_the_brightest_lig
     assert np.flatnonzero(found).tolist() == [*([11] if more else []), *([] if more else [30]), 40, 41]
 
 
+@pytest.mark.parametrize(("others", "is_bad"), [(1, True), (3, False)])
+def test_what_is_usual_counts_an_event_of_each_of_the_few_pixels_that_have_any(others, is_bad):
+    """One of 400 pixels has three events: a chance of 2e-8 where 2 of 400 have any, and of 2e-7 where 4 have."""
+    on = np.zeros((1, 2, 400), int)
+    on[0, 0, 7] = 3
+    on[0, 1, 20 : 20 + others] = 2
+    steady = trials_of(on, 0 * on, np.full((1, 400), 200), [80.0])
+    ones = np.ones((2, 2, 400), int)
+    steps = trials_of(ones, ones, np.full((2, 400), 50), [80.0, 80.0], [0.3, -0.3])
+    assert (poisson.sf(2, (1 + others) / 400) < 1e-7) == is_bad
+    assert np.flatnonzero(defects.plainly_bad(steady, steps)).tolist() == ([7] if is_bad else [])
+
+
 def test_kinds_of_bad_pixels():
     """Stuck: no event from a step; hot: hardly calm, or more events than chance gives (1e-3); else other."""
     pixels = 50
@@ -271,21 +284,32 @@ def test_kinds_of_bad_pixels():
 
 
 def test_losses_at_large_steps_are_told_from_one_in_a_thousand_on():
-    """200 pixels whose S-curves end at 1 − loss: steps beyond four spreads count, those of a dim light do not."""
-    size = np.array([0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.36, 0.8, 0.9])
+    """200 pixels whose S-curves end at 1 − loss: steps beyond four spreads count, those of a dim light do not.
+
+    The largest steps are of 0.05 % less light, which is the same light. The loss has a normal error from its scatter
+    over pixels, and one trial more.
+    """
+    size = np.array([0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.36, 0.8, 0.9, 0.95])
     contrast = np.concatenate([size, -size])
+    signal = np.tile([70.0] * 7 + [69.965] * 2 + [50.0], 2)
     pixels, trials = 200, 2000
     centre = 0.25 * (1 + 0.14 * norm.ppf((np.arange(pixels) + 0.5) / pixels))  # beyond four spreads lie 0.8 and 0.9
-    for loss, is_told in ((0.0013, True), (0.0007, False)):
-        events = np.rint(trials * norm.cdf((size[:, None] - centre) / 0.03) * (1 - loss))
-        on = np.zeros((18, 2, pixels))
+    uneven = np.where(np.arange(pixels) % 2 == 0, 1, -1)
+    for loss, is_told in ((0.0015, True), (0.0005, False)):
+        events = np.rint(trials * norm.cdf((size[:, None] - centre) / 0.03))
+        events[7:9] -= round(trials * loss) + uneven
+        events[9] -= 100
+        on = np.zeros((20, 2, pixels))
         off = on.copy()
-        on[:9, 0], off[9:, 0] = events, events
-        steps = trials_of(on, off, np.full((18, pixels), trials), np.full(18, 70.0), contrast)
+        on[:10, 0], off[10:, 1] = events, events
+        steps = trials_of(on, off, np.full((20, pixels), trials), signal, contrast)
         found = trial_checks._ceiling(steps)
         assert (found is not None) is is_told
         if is_told:
-            assert f"in {np.rint(trials * loss) / trials:.2g} of the trials" in found.text
+            assert f"in {loss:.2g} of the trials" in found.text
+            # four columns of each pixel lose 3 ± 1 trials each
+            error = np.sqrt(pixels * 4**2 + 1) / (4 * trials * pixels)
+            assert found.p_value == pytest.approx(norm.sf((loss - 0.0005) / error), rel=1e-9, abs=0)
 
 
 def test_events_away_from_the_threshold_are_told_beyond_leak():
@@ -315,6 +339,23 @@ def test_events_away_from_the_threshold_are_told_beyond_leak():
     assert "0.014 (ON) and 0.001 (OFF)" in told.text
     off[0, 0] = 0
     assert found().p_value == pytest.approx(2 * poisson.sf(699, usual + 0.5), rel=1e-6, abs=0)
+
+
+@pytest.mark.parametrize(
+    ("trials", "leak", "events", "is_told"),
+    [(500, 0.02, 587, False), (500, 0.02, 594, True), (10_000, 2e-4, 180, False), (10_000, 2e-4, 220, True)],
+)
+def test_a_floor_is_told_below_half_the_chance_of_an_alarm_and_above_one_in_ten_thousand(trials, leak, events, is_told):
+    """Of a chance of 1e-4 half for each polarity; at 80 or 120 events too many in a million trials."""
+    values = np.zeros(len(NAMES))
+    values[:2], values[LEAK], values[RESPONSE] = (0.2, 0.3), leak, 1e6
+    on = np.zeros((2, 2, 100), int)
+    on[1, 0, 0] = events
+    steps = trials_of(on, 0 * on, np.full((2, 100), trials), [60.0, 60.0], [0.4, -0.4])
+    told = trial_checks._floor(SimpleNamespace(values=values), steps)
+    usual = 100 * trials * leak * 0.5
+    chance = poisson.sf(events - 1, usual + 0.5)
+    assert (told is not None) is is_told and (chance < 5e-5) == (is_told or trials > 500) and chance < 1e-4
 
 
 @pytest.mark.parametrize(("on", "off"), [(0.071, 0.052), (0.006, 0.004)])
@@ -466,7 +507,7 @@ def test_trials_are_fitted_to_good_pixels_by_the_law_that_is_likelier(advantage,
         fits.append((set(sets[0].tolist()), law, start, rounds))
         return SimpleNamespace(
             law=law, values=np.array([float(len(fits))]),
-            covariance=np.eye(9), log_likelihood=advantage if law == "sqrt" else 0.0,
+            covariance=np.eye(9), log_likelihood=(advantage if law == "sqrt" else 0.0) - 71.5,
         )  # fmt: skip
 
     def unlike(fitted, steady, steps, good):
@@ -483,7 +524,9 @@ def test_trials_are_fitted_to_good_pixels_by_the_law_that_is_likelier(advantage,
     }  # fmt: skip
     for name, value in changes.items():
         monkeypatch.setattr(analysis, name, value)
-    found = analysis.analyse_trials(SimpleNamespace(folder=None), seed=3)
+    parts = []
+    found = analysis.analyse_trials(SimpleNamespace(folder=None), 3, lambda what, part: parts.append(part))
+    assert parts == pytest.approx([0.05, 0.3, 0.6, 0.8, 0.9])
     glances = fits[:2]
     assert [one[1] for one in glances] == ["linear", "sqrt"] and all(one[2] == (one[1], 88) for one in glances)
     assert all(len(one[0]) == 50 and one[3] == analysis._GLANCE for one in glances)
@@ -599,7 +642,9 @@ def with_one(place, value):
     [
         ({}, None),
         ({"contrast": with_one(0, 20.01)}, "within ±20"), ({"contrast": with_one(1, -20.01)}, "within ±20"),
-        ({"contrast": with_one(1, 0.0)}, "steps up"), ({"signal_dn": with_one(0, 0.0)}, "a step needs light"),
+        ({"contrast": with_one(1, 0.0)}, "steps up"), ({"contrast": with_one(0, -19.0)}, "steps up"),
+        ({"contrast": with_one(1, 19.0)}, "steps up"), ({"n_off": with_one((0, 1, 1, 0), -1)}, "below 0"),
+        ({"signal_dn": with_one(0, 0.0)}, "a step needs light"),
         ({"n_on": with_one((0, 0, 0, 0), 1)}, "more trials together"),
         ({"n_calm": with_one((1, 0, 2), 2)}, "more trials together"),
         ({"n_calm": with_one((1, 1, 0), 21)}, "fifth"), ({"edges_us": with_one(0, 1)}, "begin with 0"),
@@ -613,6 +658,7 @@ def test_trials_that_are_just_right_and_just_wrong(changes, words, tmp_path):
         found = trials_module._read(file, has_steps=True)
         assert found.settle_s == pytest.approx(9e-4) and found.shape == (2, 3)
         np.testing.assert_allclose(found.edges_s, [0, 4e-5, 1.1e-4])
+        assert found.calm.shape == (2, 6) and found.on.shape == found.off.shape == (2, 2, 6)
         for name, values in (("n_calm", found.calm), ("n_on", found.on), ("n_off", found.off)):
             np.testing.assert_array_equal(values.reshape(arrays_of()[name].shape), arrays_of()[name])
     else:
@@ -643,10 +689,11 @@ def test_weights_of_cells_are_found_with_the_fit(spread, monkeypatch):
 def test_grids_of_thresholds_are_laid_about_the_fit_before(monkeypatch):
     """Twice: about the start, and about the end of the first round, whose grid is kept with the result."""
     laid, size = [], len(NAMES)
+    scores, free = np.random.default_rng(4).normal(0.0, 3.0, (40, size)), np.arange(size) != fit.LEAK
 
     def climb(likelihood, values, rounds):
         assert likelihood == laid[-2:] and rounds == 7
-        return values * 1.1, np.ones((5, size)), np.ones(size, bool), -3.0 - len(laid)
+        return values * 1.1, scores, free, -3.0 - len(laid)
 
     def grid(theta, mismatch):
         laid.append((theta, mismatch))
@@ -661,3 +708,30 @@ def test_grids_of_thresholds_are_laid_about_the_fit_before(monkeypatch):
     np.testing.assert_allclose(laid, [*at, *(1.1 * np.array(at))])
     np.testing.assert_allclose(found.values, 1.21 * start)
     assert found.likelihood == laid[2:]
+    # inverse of the sum of squares of scores, of the logarithms, and the error of the law
+    inverse = np.linalg.inv(scores[:, free].T @ scores[:, free])
+    of_law = np.diag([0.0, 0.0, 0.0, 0.0, 0.004, 0.01, 0.015, 0.02]) @ np.diag(found.values[free])
+    wanted = found.values[free][:, None] * inverse * found.values[free] + of_law**2
+    np.testing.assert_allclose(found.covariance[np.ix_(free, free)], wanted)
+    assert np.isnan(found.covariance[~free]).all() and np.isnan(found.covariance[:, ~free]).all()
+    for k, name in enumerate(NAMES):
+        assert found.value(name) == found.values[k]
+        np.testing.assert_allclose(found.error(name), np.sqrt(wanted[k, k]) if free[k] else np.nan)
+
+
+@pytest.mark.parametrize(("size", "is_reported"), [(3.9, False), (4.1, True)])
+def test_a_search_that_ended_four_errors_from_the_best_is_reported(size, is_reported):
+    """Scores of 30 pixels whose sum is that of a point so many standard errors away, whatever the units."""
+    rng = np.random.default_rng(7)
+    scores = rng.standard_normal((30, 3)) * [40.0, 0.3, 5.0]
+    scores -= scores.mean(axis=0)
+    free = np.array([True, False, True, True])
+    away = np.array([0.6, -0.64, 0.48])
+    # with a mean a of all scores, sᵀ S⁻¹ s of n of them is n x/(1 + x), x = n aᵀ C⁻¹ a, C that of the centred ones
+    x = size**2 / 30 / (1 - size**2 / 30)
+    root = np.linalg.cholesky(scores.T @ scores)
+    scores += root @ away / np.linalg.norm(away) * np.sqrt(x / 30)
+    told = trial_checks._ended(SimpleNamespace(scores=np.insert(scores, 1, 99.0, axis=1), free=free))
+    assert (told is not None) == is_reported
+    if told is not None:
+        assert told.check == "fit" and "ended 4.1 standard errors" in told.text

@@ -310,7 +310,7 @@ def _with_dark_noise(result: PairCalibration) -> VarianceFit:
     noise, fit = result.rounded_noise, result.fit
     if noise is None:
         return fit
-    line = np.array([1.0, 0.0, result.pairs.spatial_dark.exposure_s, 0.0, 0.0, 0.0]) * fit.identified
+    line = np.array([1.0, 0.0, result.pairs.spatial_dark.exposure_s, 0.0, 0.0, 0.0])
     shared = sum(max(value, 0.0) for value, _ in (result.row, result.col))
     error = 2 * noise.value * (noise.high - noise.low) / (2 * Z_95)
     own = error**2 + result.row[1] ** 2 + result.col[1] ** 2
