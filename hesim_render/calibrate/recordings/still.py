@@ -35,6 +35,8 @@ USUAL_MISMATCH = 0.1
 _RATIO_SHIFT, _LEAK_SHIFT = 1.0, 3.0
 #: Relative error of the leak in the light of a moving target.
 UNSURE_LEAK = 0.1
+#: Standard errors below 0 from which a leak is none.
+_BELOW_0 = 3.0
 #: Range in which the ratio of the thresholds is taken to be where nothing tells it.
 _RATIO = (0.5, 2.0)
 
@@ -158,7 +160,13 @@ def _with_ratio(
 ) -> LeakBalance:
     errors = np.hypot(jackknife(leak), unknown)
     leaks = [estimated(one[0], float(error), "Hz", GROUPS) for one, error in zip(leak, errors, strict=True)]
-    return LeakBalance(ratio, leaks, *_line(leak, unknown, np.ones(len(leak), np.bool_), lux))
+    known = leak[:, 0] > -_BELOW_0 * errors
+    for k in np.flatnonzero(~known):
+        leaks[k] = not_identifiable(
+            f"the levels do not balance: it would be {leak[k, 0]:.3g} Hz, and a leak makes ON events. The reference "
+            "does not follow its events by whole thresholds, as that of pixels whose noise is fast beside their dead time"
+        )
+    return LeakBalance(ratio, leaks, *_line(leak, unknown, known, lux))
 
 
 def _leak_alone(rates: NDArray[np.float64], why: str) -> dict[str, Any]:
@@ -197,7 +205,8 @@ def _line(
         return reason, reason
     level = np.asarray(lux, np.float64)[known]
     if np.unique(level).size < 2:
-        reason = not_identifiable(f"the leak is known at {np.unique(level).size} lights; two are needed")
+        at = "one light" if known.any() else "no light"
+        reason = not_identifiable(f"the leak is known at {at}; two are needed")
         return reason, reason
     weight = 1 / np.maximum(np.hypot(jackknife(leak[known]), unknown[known]), 1e-12)
     # the line as a matrix on the leaks, so that errors go through it
@@ -225,14 +234,21 @@ def share(count: int, of: int) -> dict[str, Any]:
 
 
 def hot_pixels(tallies: Sequence[EventTally]) -> NDArray[np.bool_]:
-    """Pixels [pixel] with many more ON events than the others, in each recording."""
-    hot = np.ones(tallies[0].pixels, np.bool_)
-    for one in tallies:
-        count = one.per_pixel()[0]
-        # mean of the lower nine tenths, which hot pixels do not change
-        usual = float(np.sort(count)[: max(1, round(0.9 * count.size))].mean()) + 1 / count.size
-        hot &= count > stats.poisson.isf(_HOT_CHANCE / count.size, _HOT * usual)
-    return hot
+    """Pixels [pixel] with many more ON events than the others, in each recording that can show it.
+
+    Where the others are so busy that a pixel of that rate would not stand out, it has half of that rate at least.
+    """
+    counts = np.array([one.per_pixel()[0] for one in tallies])
+    seconds = np.array([one.seconds for one in tallies])[:, None]
+    # mean of the lower nine tenths, which hot pixels do not change
+    lower = np.sort(counts, axis=1)[:, : max(1, round(0.9 * counts.shape[1]))]
+    usual = lower.mean(axis=1, keepdims=True) + 1 / counts.shape[1]
+    limit = stats.poisson.isf(_HOT_CHANCE / counts.shape[1], _HOT * usual)
+    stands_out = counts > limit
+    rate_hz = counts / seconds
+    least_hz = np.where(stands_out, rate_hz, np.inf).min(axis=0)
+    hidden = (least_hz * seconds <= limit) & (rate_hz >= 0.5 * least_hz)
+    return np.asarray(stands_out.any(axis=0) & np.all(stands_out | hidden, axis=0))
 
 
 def hot_share(tallies: Sequence[EventTally]) -> dict[str, Any]:
