@@ -163,8 +163,8 @@ def _with_ratio(
     known = leak[:, 0] > -_BELOW_0 * errors
     for k in np.flatnonzero(~known):
         leaks[k] = not_identifiable(
-            f"the levels do not balance: it would be {leak[k, 0]:.3g} Hz, and a leak makes ON events. The reference "
-            "does not follow its events by whole thresholds, as that of pixels whose noise is fast beside their dead time"
+            f"the levels do not balance: it would be {leak[k, 0]:.3g} Hz, and a leak makes ON events. The "
+            "reference does not follow its events by whole thresholds, as where noise is fast beside the dead time"
         )
     return LeakBalance(ratio, leaks, *_line(leak, unknown, known, lux))
 
