@@ -183,7 +183,8 @@ def slices_tally(per_slice):
     """Counts of 20 slices of a recording of 40 pixels and 2 s."""
     slices = np.zeros((2, SLICES, GROUPS))
     slices[0, :, 3], slices[1, :, 5] = np.asarray(per_slice) * 0.75, np.asarray(per_slice) * 0.25
-    return SimpleNamespace(slices=slices, pixels=PIXELS, seconds=2.0, waves=np.zeros((2, SLICES)))
+    return SimpleNamespace(slices=slices, pixels=PIXELS, seconds=2.0, waves=np.zeros((2, SLICES)),
+                           period_s=lambda: None)  # fmt: skip
 
 
 def test_a_scene_is_not_still_beyond_half_of_its_rate_or_a_burst():
@@ -203,6 +204,19 @@ def test_a_scene_is_not_still_beyond_half_of_its_rate_or_a_burst():
         high = next(c for c in range(400, 4000, 4) if c > stats.poisson.isf(1e-3 / 20, 3 * (19 * 400 + c) / 20))
         burst[9] = 4 * round(factor * high / 4)
         assert (still.not_still(slices_tally(burst)) is not None) is is_told
+
+
+@pytest.mark.parametrize(("turns", "period", "lamp", "is_seen"), [
+    ((200, 100), 0.83, None, True), ((200, 99), 0.83, None, False), ((200, 100), None, None, False),
+    ((200, 100), 0.01, "a lamp", False),
+])  # fmt: skip
+def test_pixels_that_see_a_steady_change_are_of_no_still_scene(monkeypatch, turns, period, lamp, is_seen):
+    monkeypatch.setattr(still, "of_a_lamp", lambda tally: lamp)
+    one = slices_tally(np.full(20, 4000.0))
+    one.period_s, one.turns_us = lambda: period, [np.ones(count) for count in turns]
+    assert (still.moving(one) is not None) is is_seen
+    told = still.not_still(one)
+    assert told == lamp if not is_seen else "turn from OFF to ON events every 0.83 s" in told
 
 
 def test_on_events_of_one_phase_are_those_of_a_lamp():

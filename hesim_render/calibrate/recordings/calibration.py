@@ -133,7 +133,7 @@ def figures(
             one.used &= ~hot
     of_target = target.unknown("it takes a recording of a moving target (--target)")
     # levels are balanced where the light and the camera are steady
-    steady = [k for k, one in enumerate(tallies) if still.unsteady(one) is None]
+    steady = [k for k, one in enumerate(tallies) if not (still.unsteady(one) or still.moving(one))]
     calm, calm_lux = [tallies[k] for k in steady], None if lux is None else [lux[k] for k in steady]
     result = still.balance(calm, calm_lux)
     if moving is not None and contrast is not None:

@@ -29,6 +29,8 @@ _BURST_CHANCE = 1e-3
 _LEAST_FLICKER, _FLICKER_POWER = 0.1, 4.0
 #: Periods of a lamp in a slice of a recording that tells it.
 _LEAST_PERIODS = 2.0
+#: Turns from OFF to ON events that tell a period.
+_FEWEST_TURNS = 300
 #: Relative standard deviation of thresholds over pixels, where none was measured.
 USUAL_MISMATCH = 0.1
 #: Shift of ρ, and of a leak over ρ n₋, in squares of the mismatch.
@@ -295,7 +297,20 @@ def unsteady(tally: EventTally) -> str | None:
 
 def not_still(tally: EventTally) -> str | None:
     """A line that says that a recording is not one of a still scene in steady light; None where it may be."""
-    return unsteady(tally) or of_a_lamp(tally)
+    return unsteady(tally) or of_a_lamp(tally) or moving(tally)
+
+
+def moving(tally: EventTally) -> str | None:
+    """A line that says that the pixels see their light change again and again, at a steady rate; None where they do
+    not, or a lamp does it.
+    """
+    period_s = tally.period_s()
+    if period_s is None or sum(one.size for one in tally.turns_us) < _FEWEST_TURNS or of_a_lamp(tally) is not None:
+        return None
+    return (
+        f"most of its pixels turn from OFF to ON events every {period_s:.3g} s: a target that moves by, or light that "
+        "changes; a target is given by --target"
+    )
 
 
 def of_a_lamp(tally: EventTally) -> str | None:
