@@ -107,7 +107,8 @@ def _transfer_rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
     of_pairs = _is_of_pairs(section)
     names = {
         "K": "K, system gain (EMVA 1288)", "read_noise_e": "read noise", "dark_current_e_per_s": "dark current",
-        "full_well_e": "saturation capacity", "dsnu_e": "DSNU" if of_pairs else "DSNU (without rows)", "prnu_percent": "PRNU",
+        "full_well_e": "saturation capacity", "prnu_percent": "PRNU",
+        "dsnu_e": "DSNU" if of_pairs else "DSNU (without rows)",
         "linearity_error_percent": "linearity error", "row_noise_dn": "temporal row noise",
         "quantum_efficiency": "quantum efficiency", "responsivity": "responsivity",
         "temporal_dark_noise_e": "temporal dark noise (EMVA 1288)", "column_noise_dn": "temporal column noise",
