@@ -64,8 +64,8 @@ def findings(result: PairCalibration) -> list[Finding]:
         if _are_alike(_variance_residual(result)):
             text = (
                 f"the variances lie on another curve than the polynomial of the model, {amount} off it (χ²/dof "
-                f"{result.level_chi2:.1f}): as where a full well bends the signal long before its end, or the ADC's steps are "
-                "uneven"
+                f"{result.level_chi2:.1f}): as where a full well bends the signal long before its end, or where steps "
+                "of the ADC are not even"
             )
         outcome.append(("variance", text))
     outcome += missing_codes(result.lit, result.dark)
