@@ -39,11 +39,7 @@ def _value(entry: dict[str, Any]) -> tuple[str, str, str]:
     if entry["value"] is None:
         return "–", "", entry["reason"]
     if "upper_limit" in entry:
-        return (
-            f"<\N{NO-BREAK SPACE}{figure(entry['upper_limit'], 3)}",
-            "",
-            _joined(entry.get("unit", ""), entry.get("note", "")),
-        )
+        return f"< {figure(entry['upper_limit'], 3)}", "", _joined(entry.get("unit", ""), entry.get("note", ""))
     between = entry.get("interval_95")
     interval = f"{figure(between[0])} to {figure(between[1])}" if between else ""
     return figure(entry["value"]), interval, _joined(entry.get("unit", ""), entry.get("note", ""))
