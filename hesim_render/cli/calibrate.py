@@ -22,8 +22,9 @@ from hesim_render.cli.options import (
     sensor_keys_only,
 )
 from hesim_render.cli.terminal import parse_exposures, parse_size, split_overrides
-from hesim_render.core.errors import RangeError
+from hesim_render.core.errors import ConflictError, RangeError
 from hesim_render.core.output import check_target, free_place
+from hesim_render.core.region import parse_roi
 
 app = typer.Typer(
     no_args_is_help=True, help="Noise parameters of a sensor from captures, real or simulated.", rich_markup_mode=None
@@ -194,6 +195,9 @@ def recording(
         float | None, typer.Option(help="bright-dark cycles a pixel sees per second; default as recorded", hidden=True)
     ] = None,
     size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of the sensor, if files do not state it")] = None,
+    roi: Annotated[
+        str | None, typer.Option(help="WIDTHxHEIGHT+X+Y of recordings that count the pixels of a crop from 0")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file of figures")] = False,
     json_: Json = False,
     quiet: Quiet = False,
@@ -205,12 +209,17 @@ def recording(
     """
     from hesim_render.calibrate.recordings import calibrate_recordings
 
-    shape, levels = None if size is None else parse_size(size), None if lux is None else _levels(lux)
+    shape, levels, first = None if size is None else parse_size(size), None if lux is None else _levels(lux), (0, 0)
+    if roi is not None:
+        width, height, x, y = parse_roi(roi)
+        if shape is not None or x is None or y is None:
+            raise ConflictError("--roi", roi, "--roi must be WIDTHxHEIGHT+X+Y, and stands in place of --size")
+        shape, first = (height, width), (y, x)
     console = Console(json_, quiet)
     with console.progress("calibrate recording") as move:
         result = calibrate_recordings(
             files, out, lux=levels, target_file=target, target_contrast=contrast, target_hz=target_hz, shape=shape,
-            overwrite=overwrite, progress=move.part,
+            first=first, overwrite=overwrite, progress=move.part,
         )  # fmt: skip
     lines = []
     for one in result["recordings"]:

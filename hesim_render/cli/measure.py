@@ -114,5 +114,8 @@ def compare(
         lines.append(
             f"{one.name:<11} {one.value:>9.4g} {between:>19} {one.within:>12.4g}  {numbers:<19} {mark}".rstrip()
         )
+    sizes = [f"{one.shape[1]}x{one.shape[0]}" for one in statistics]
+    if sizes[0] != sizes[1]:
+        lines.append(f"of {sizes[0]} and {sizes[1]} px, compared pixel by pixel: one should show what the other does")
     lines += [f"{one.name}: {one.definition}" for one in result]
     console.result("\n".join(lines), {"distances": [one.described() for one in result]})

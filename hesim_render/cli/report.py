@@ -43,10 +43,11 @@ def report(
             captures, out, size=shape, seed=seed, overwrite=overwrite,
             progress=move.part,
         )  # fmt: skip
-    lines = []
     tables = [] if result.events is None else event_tables(result.events)[:1]
-    for table in [*tables, *([] if result.frames is None else frame_tables(result.frames)[:1])]:
-        lines += [f"{name:<34} {value:>10}  {between:<24} {unit}" for name, value, between, unit, *_ in table.rows]
+    tables += [] if result.frames is None else frame_tables(result.frames)[:1]
+    rows = [row for table in tables for row in table.rows]
+    widest = max(len(row[0]) for row in rows)
+    lines = [f"{name:<{widest}} {value:>10}  {between:<24} {unit}" for name, value, between, unit, *_ in rows]
     files = {kind: result.folder / f"report.{kind}" for kind in ("html", "pdf", "json")}
     lines.append(f"in {out}: {', '.join(file.name for file in files.values())}")
     console.result(

@@ -184,22 +184,12 @@ class EventDistance:
 
 
 def event_distances(first: EventStatistics, second: EventStatistics) -> list[EventDistance]:
-    """All distances of two streams.
+    """All distances of two streams, which may be of sensors of different sizes: figures are those of a pixel.
 
     Parameters
     ----------
     first, second : statistics of the streams, from `event_statistics`.
-
-    Raises
-    ------
-    SpecError
-        If the streams are of different sensors.
     """
-    if first.shape != second.shape:
-        (rows, cols), (own_rows, own_cols) = second.shape, first.shape
-        raise SpecError(
-            f"is of {cols}x{rows} px; expected {own_cols}x{own_rows}, as {first.source}", file=second.source
-        )
     rng = np.random.default_rng(_SEED)
     # the parts of a stream, drawn with replacement: twice of the first, once of the second
     draws = rng.integers(0, PARTS, (3, _DRAWS, PARTS))

@@ -207,7 +207,10 @@ def _shared(result: PairCalibration, real: Half, twin: Half) -> list[Check]:
     checks = []
     for name, key, fitted in (("row", "row", result.row[1]), ("column", "col", result.col[1])):
         values = [getattr(half.dark, key)[t] for half in (real, twin)]
-        error = np.sqrt(sum(float(v.var(ddof=1)) / v.size for v in values) + fitted**2) if t.size > 2 else fitted * 2
+        own = [np.mean(getattr(half.dark, f"{key}_error")[t] ** 2) for half in (real, twin)]
+        if t.size > 2:  # pairs may differ by more than their rows, or columns, tell
+            own = [max(float(v.var(ddof=1)), one) for v, one in zip(values, own, strict=True)]
+        error = np.sqrt(sum(own) / t.size + fitted**2)
         means = [np.array([v.mean()]) for v in values]
         name = f"temporal {name} variance, dark"
         checks.append(Check(name, "DN²", "", np.zeros(1), means[0], means[1], np.array([error])))

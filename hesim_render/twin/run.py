@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hesim_render.calibrate.aps.long_series import long_series
 from hesim_render.calibrate.aps.pair_levels import both_levels, without_stuck
 from hesim_render.calibrate.aps.pairs import DARK_NOISE_LIMIT_DN, PairCalibration
-from hesim_render.calibrate.aps.pairs_findings import findings
+from hesim_render.calibrate.aps.pairs_findings import findings, missing_codes
 from hesim_render.calibrate.aps.pairs_output import calibrate_pairs
 from hesim_render.calibrate.aps.sensor_file import write_sensor
 from hesim_render.calibrate.estimate import Finding
@@ -93,6 +93,9 @@ def make_twin(
         twin = Half(*simulated, bench.long(held, False), bench.long(held, True))
         checks = compare(result, held, real, twin)
         own_findings = findings(result)
+        # grey values near the levels that were held out alone
+        unknown = tuple(sorted(set(real.lit.missing) - set(result.lit.missing)))
+        own_findings += [Finding(*named, None) for named in missing_codes(replace(real.lit, missing=unknown))]
         if result.dark_noise_is_rounded_off:
             text = _under_rounding(result)
             own_findings.append(Finding("twin", text, None))

@@ -112,6 +112,18 @@ def test_patterns_are_those_of_rows_and_of_columns():
     assert found["bandwidth_rel"]["value"] == 0 and found["bandwidth_rel"]["upper_limit"] < 1e-3
 
 
+@pytest.mark.parametrize(("first", "signs"), [((2, 4), (1, 1)), ((3, 4), (-1, 1)), ((6, 1), (1, -1))])
+def test_rows_of_a_crop_are_odd_where_those_of_the_sensor_are(first, signs):
+    y, x = np.divmod(np.arange(PIXELS), SHAPE[1])
+    y, x = y + first[0], x + first[1]
+    rate = 40 * (1 + 0.25 * (2 * (y % 2) - 1)) * (1 - 0.1 * (2 * (x % 2) - 1))
+    one = made_tally([[rate, rate], [0.8 * rate, 0.8 * rate]])
+    for origin, sign in ((first, (1, 1)), ((0, 0), signs)):
+        found = noise_spread(one, origin)
+        assert found["odd_rows_rel"]["value"] == pytest.approx(0.25 * sign[0])
+        assert found["odd_cols_rel"]["value"] == pytest.approx(-0.1 * sign[1])
+
+
 def test_what_is_not_identifiable_says_why():
     even = np.full(PIXELS, 40.0)
     weak = noise_spread(made_tally([[even, even], [even, even]], gap_us=200.0))

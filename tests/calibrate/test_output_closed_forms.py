@@ -10,7 +10,7 @@ from scipy.stats import norm
 from hesim_render.calibrate.aps import light_curve, long_series, pair_levels, pairs_output
 from hesim_render.calibrate.aps import output as frames_output
 from hesim_render.calibrate.aps.common_mode import Shared
-from hesim_render.calibrate.aps.pairs_findings import findings
+from hesim_render.calibrate.aps.pairs_findings import findings, missing_codes
 from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal
 from hesim_render.calibrate.asynchronous import likelihood
 from hesim_render.calibrate.asynchronous import output as trials_output
@@ -28,8 +28,9 @@ K, RELATIVE = 0.37, 0.021
 def lit_pairs(**changed):
     """Variances of pairs in the light, DN², and the part of pixels at the end of the ADC's range."""
     given = {"variance": [2.3, 6.1, 19.0, 18.9], "row": [0.1, 0.2, 0.3, -0.4], "error": [0.2, 0.3, 0.5, 0.6],
-             "high": [0.0, 0.0, 0.004, 0.2]}  # fmt: skip
-    return SimpleNamespace(**{name: np.array(values) for name, values in {**given, **changed}.items()})
+             "high": [0.0, 0.0, 0.004, 0.2], "exposure_s": [0.1, 0.2, 0.3, 0.3]}  # fmt: skip
+    arrays = {name: np.array(values) for name, values in {**given, **changed}.items()}
+    return SimpleNamespace(**arrays, missing=())
 
 
 def calibration(**changed):
@@ -49,7 +50,10 @@ def calibration(**changed):
         "lines_dn2": 0.7, "row": (0.62, 0.05), "col": (0.04, 0.03),
         "light": np.array([100.0, 300.0, 900.0, 1500.0]), "saturation": 2, "signal": np.array([22.0, 66, 190, 200]),
         "clear": np.array([1, 1, 0, 0], bool), "lit": lit_pairs(), "brightest_dn": 207.0,
-        "dark": SimpleNamespace(exposure_s=np.array([0.1, 0.2, 0.3, 0.3]), change=np.array([0.3, -0.3, 0.2, 0.2])),
+        "dark": SimpleNamespace(
+            exposure_s=np.array([0.1, 0.2, 0.3, 0.3]), change=np.array([0.3, -0.3, 0.2, 0.2]), missing=()
+        ),
+        "fit": SimpleNamespace(beta=np.array([0.4, 0.05, 0.0, 0.0, 0.0, 0.0])),
         "long_dark": SimpleNamespace(spatial=spatial_dark, mean=mean, temporal=dark_noise),
         "long_lit": SimpleNamespace(spatial=spatial_lit, mean=mean + 120, temporal=lit_noise, frames=16),
         "linearity": (np.array([1, 0, 1, 1], bool), np.array([-0.4, 0.1, 0.9])),
@@ -277,10 +281,10 @@ def test_findings_of_emva_captures_begin_at_their_limits():
     # three dark pairs of different exposures, 1 DN apart, whose mean is 3.9 of its errors
     for most, is_seen in ((3.9, False), (3.9 * 1.01, True)):
         change = np.array([-1.0, 0.0, 1.0, 9.0]) + most / np.sqrt(3)
-        dark = SimpleNamespace(exposure_s=np.array([0.1, 0.2, 0.3, 0.3]), change=change)
+        dark = SimpleNamespace(exposure_s=np.array([0.1, 0.2, 0.3, 0.3]), change=change, missing=())
         assert ("image lag" in named(dark=dark)) is is_seen
     for size in (0.049, 0.051):
-        dark = SimpleNamespace(exposure_s=np.arange(16.0), change=size + 0.04 * (-1) ** np.arange(16))
+        dark = SimpleNamespace(exposure_s=np.arange(16.0), change=size + 0.04 * (-1) ** np.arange(16), missing=())
         assert ("image lag" in named(dark=dark)) is (size > 0.05)
     assert "stuck pixels" not in named()
     mean = calibration().long_lit.mean.copy()
@@ -288,6 +292,36 @@ def test_findings_of_emva_captures_begin_at_their_limits():
     assert "stuck pixels" in named(long_lit=SimpleNamespace(**{**lit, "mean": mean}))
     other = SimpleNamespace(**{**vars(calibration().pairs), "spatial_lit": SimpleNamespace(photons=301.0)})
     assert "light of the long series" not in named(pairs=other)  # beyond the brightest clear level
+
+
+def test_levels_that_are_off_to_one_side_lie_on_another_curve():
+    """Deviations of ten levels with one change of sign, against the same ones with nine."""
+    light = np.linspace(100, 900, 10)
+    signal, clear = 0.22 * (light + 2) * 1.0021, np.ones(10, bool)
+    smooth = np.array([0.9, 1.3, 1.1, 0.8, 0.4, -0.5, -0.9, -1.2, -1.0, -0.9])
+    curve = SimpleNamespace(**{**vars(calibration().curve), "light_rms": 6e-4})
+    for away, is_alike in ((smooth, True), (np.abs(smooth) * (-1) ** np.arange(10), False)):
+        variance = 0.4 + 0.05 * signal + 1 / 12 + 0.2 * away  # β₀ + β₁ I and the ADC's
+        lit = lit_pairs(variance=variance, error=np.full(10, 0.2), row=np.zeros(10), high=np.zeros(10),
+                        exposure_s=np.ones(10))  # fmt: skip
+        found = findings(calibration(light=light, signal=signal * (1 + 6e-4 * away), clear=clear, lit=lit, curve=curve,
+                                     level_rms=0.031))  # fmt: skip
+        texts = {one.check: one.text for one in found}
+        assert ("another curve than the polynomial of the model, 3.1 % off" in texts["variance"]) is is_alike
+        assert ("scatter by 3.1 %" in texts["variance"]) is not is_alike
+        assert ("0.06 % off the curve of three terms" in texts["light"]) is is_alike
+        assert ("the light scatters by 0.06 %" in texts["light"]) is not is_alike
+
+
+def test_missing_codes_are_listed_once_each():
+    lit = lit_pairs()
+    assert missing_codes(lit, lit) == []
+    lit.missing = (19, 77)
+    ((check_, text),) = missing_codes(lit, SimpleNamespace(missing=(3, 19)))
+    assert check_ == "missing code" and text.startswith("no frame has the grey value 3, 19, 77, though")
+    assert "missing code" in {one.check for one in findings(calibration(lit=lit))}
+    ((_, text),) = missing_codes(SimpleNamespace(missing=tuple(range(11, 40, 4))))
+    assert "11, 15, 19, 23, 27, 31 and others, though" in text
 
 
 def test_findings_of_emva_captures_have_their_figures_in_their_units():
@@ -298,7 +332,7 @@ def test_findings_of_emva_captures_have_their_figures_in_their_units():
     )
     line = SimpleNamespace(cycles_per_row=0.125, cycles_per_col=0.25, rms_dn=0.37)
     spectrum = SimpleNamespace(lines=[line] * 4, correlated=True, correlation=0.045)
-    lag = SimpleNamespace(exposure_s=np.arange(16.0), change=np.full(16, 0.62), variance=np.array([0.213]))
+    lag = SimpleNamespace(exposure_s=np.arange(16.0), change=np.full(16, 0.62), least_variance=0.213, missing=())
     black = SimpleNamespace(**{**vars(given.black), "rms": 0.61})
     mean = np.full((14, 22), 112.0)
     mean[3, 5] = 0.4

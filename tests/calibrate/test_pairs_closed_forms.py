@@ -1,5 +1,7 @@
 """Lines, curves and spectra of EMVA 1288 captures: against polyfit, sums written out, and waves of known size."""
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,10 +10,11 @@ from scipy.stats import chi2 as chi2_law
 from scipy.stats import f as f_law
 from scipy.stats import gamma
 
-from hesim_render.calibrate.aps import light_curve, noise_spectrum, pairs, spatial
+from hesim_render.calibrate.aps import light_curve, noise_spectrum, pair_levels, pairs, spatial
 from hesim_render.calibrate.aps.light_curve import require_steady_light
 from hesim_render.calibrate.aps.pair_levels import Levels, SpatialStack, pair_statistics
 from hesim_render.core.errors import SpecError
+from hesim_render.recording.pair_set import Series
 
 X = np.array([1.0, 2.5, 4.0, 7.0, 11.0])
 
@@ -169,6 +172,33 @@ def test_levels_are_clear_up_to_one_pixel_in_ten_thousand():
     low, high = np.array([1e-4, 1.1e-4, 0, 0]), np.array([0, 0, 1e-4, 1.1e-4])
     none = np.zeros(4)
     assert Levels(*[none] * 11, low, high).clear.tolist() == [True, False, True, False]
+
+
+def test_the_least_variance_has_what_rows_and_columns_share():
+    one = Levels(*[np.zeros(2)] * 13)
+    one = replace(one, variance=np.array([0.21, 0.19]), row=np.array([-0.02, 0.04]), col=np.array([0.05, 0.01]))
+    assert one.least_variance == pytest.approx(0.24)
+
+
+@pytest.mark.parametrize("code", [31, 37])
+def test_a_grey_value_that_no_frame_has_is_named(code):
+    """Three levels about 30, 36 and 42 with a noise of 1.7: the value that is moved to the next one is missing; those
+    that only the last frames lack, or no frame reaches, are not.
+    """
+    rng = np.random.default_rng(8)
+    frames = {}
+    for level in (30.0, 36.0, 42.0):
+        two = np.rint(level + 1.7 * rng.standard_normal((2, 60, 71))).astype(np.uint16)
+        two[two == code] = code + 1
+        frames[level] = two
+    frames[42.0][frames[42.0] == 43] = 42
+    series = tuple(Series(True, level, None, (), Path(), None) for level in frames)
+    given = SimpleNamespace(spec=SimpleNamespace(full_scale_dn=255), frames=lambda one: iter(frames[one.exposure_s]))
+    found = pair_levels.pair_levels(given, series)
+    # 43 is one step from the brightest level, and the other frames have next to none
+    assert found.missing == (code, 43)
+    frames[36.0][0, 0, :2] = 43
+    assert pair_levels.pair_levels(given, series).missing == (code,)
 
 
 @pytest.mark.parametrize(("row", "col", "cols"), [(3, 5, 32), (0.5, 0.5, 32), (21, 7, 33), (10, 0.5, 32)])

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hesim_render.calibrate.aps.rounded_noise import grey_moments, levels_of, rounded_noise
+from hesim_render.calibrate.aps.long_series import Long
+from hesim_render.calibrate.aps.pair_levels import levels, pair_statistics
+from hesim_render.calibrate.aps.rounded_noise import grey_moments, levels_of, rounded_noise, without_rounding
+from hesim_render.calibrate.aps.spatial import Temporal, spatial_variance
 
 SHAPE = (53, 71)
 
@@ -64,3 +67,32 @@ def test_levels_keep_the_order_of_the_means_and_have_the_law_of_the_grey_values(
     assert np.all(np.diff(one.mean[good][order]) >= 0)
     assert stats.kstest(levels[good], stats.norm(0, 0.37).cdf).statistic < 1e-3
     assert levels[9, 11] == one.mean[9, 11] - one.mean[good].mean()
+
+
+@pytest.mark.parametrize(("level", "shift"), [(64.0, 0.31), (64.5, -0.27)])
+def test_noise_above_the_limit_of_the_standard_is_free_of_rounding(level, shift):
+    """0.35 DN of pixels and 0.21 of columns, and levels of 0.13 DN at or between whole numbers, as a black level may
+    be: pairs at that level and beside it, and the spread of the levels. Rounding alone moves them by 13, 3 and 9 %.
+    """
+    measured, results = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        own = rng.standard_normal(SHAPE)
+        own = level + 0.13 * (own - own.mean()) / own.std()
+        own = own - np.add.outer([0.0, shift], np.zeros((13, *SHAPE)))
+        own += 0.35 * rng.standard_normal(own.shape) + 0.21 * rng.standard_normal((2, 13, 1, SHAPE[1]))
+        frames = np.rint(own)
+        dark = levels([0.01, 0.02], [0.0, 0.0], [pair_statistics(*two[:2], 1023) for two in frames])
+        mean, variance = frames[0, 2:].mean(axis=0), frames[0, 2:].var(axis=0, ddof=1)
+        columns = float(frames[0, 2:].mean(axis=1).var(axis=0, ddof=1).mean() - variance.mean() / SHAPE[0])
+        temporal = Temporal(float(variance.mean()) - columns, 0.0, columns, 0.0, 0.0, 0.0)
+        one = Long(mean, variance, frames[0, 2], 11, np.zeros(11), temporal,
+                   spatial_variance(mean, temporal, 11, variance), None)  # fmt: skip
+        free, series = without_rounding(dark, one)
+        measured.append([*(dark.variance - 1 / 12), *dark.col, one.spatial.pixel])
+        results.append([*(free.variance - 1 / 12), *free.col, series.spatial.pixel])
+    true = np.array([0.35**2, 0.35**2, 0.21**2, 0.21**2, 0.13**2])
+    error = np.std(results, axis=0) / np.sqrt(8) / true
+    away = np.mean(results, axis=0) / true - 1
+    assert np.all(np.abs(away) < 4 * error + 0.01)
+    assert abs(np.mean(measured, axis=0) / true - 1)[0] > 0.1

@@ -146,15 +146,46 @@ def test_a_pixel_is_hot_beyond_the_tail_of_ten_times_the_usual_rate(off):
     usual = (18 * 30 + 18 * 50) / 36 + 1 / PIXELS
     least = stats.poisson.isf(1e-3 / PIXELS, 10 * usual)
     counts = np.array([30] * 18 + [50] * 18 + [60] * 3 + [int(least) + 1 - off])
-    one = SimpleNamespace(pixels=PIXELS, per_pixel=lambda: np.stack([counts, 0 * counts]))
+    one = SimpleNamespace(pixels=PIXELS, seconds=0.7, per_pixel=lambda: np.stack([counts, 0 * counts]))
     assert still.hot_pixels([one, one]).sum() == 1 - off
+
+
+def test_a_hot_pixel_may_be_hidden_among_busy_ones():
+    """In the first, of 3 s, pixels have 6 events and four stand out. In the second, of 2 s, others have 160, so that
+    none could; what has half of its rate is hot. A rate of 300 Hz would stand out in the third, of 1 s.
+    """
+    calm, busy, third = np.full(PIXELS, 6), np.full(PIXELS, 160), np.full(PIXELS, 3)
+    calm[[2, 9, 17, 30]] = 600, 570, 900, 900  # 200, 190, 300 and 300 Hz
+    busy[[2, 9, 17, 30]] = 201, 189, 700, 700
+    third[[2, 9, 17, 30]] = 200, 190, 20, 300
+    given = [
+        SimpleNamespace(pixels=PIXELS, seconds=s, per_pixel=lambda c=counts: np.stack([c, 0 * c]))
+        for counts, s in ((calm, 3.0), (busy, 2.0), (third, 1.0))
+    ]
+    assert np.flatnonzero(still.hot_pixels(given[:2])).tolist() == [2, 17, 30]
+    assert np.flatnonzero(still.hot_pixels(given)).tolist() == [2, 30]
+
+
+def test_levels_that_do_not_balance_tell_no_leak(monkeypatch):
+    """Of three lights, the one whose leak is below 0 by more than three errors has a reason and no part in the line."""
+    monkeypatch.setattr(still, "jackknife", lambda values: np.full(values.shape[:-1], 0.03))
+    leak = np.repeat([[0.2], [-0.16], [0.5]], GROUPS + 1, axis=1)
+    for error, values in ((0.04, [0.2, None, 0.5]), (0.05, [0.2, -0.16, 0.5])):
+        found = still._with_ratio(leak, np.full(3, error), [1.0, 2.0, 4.0], {"value": 1.3})
+        assert [one["value"] for one in found.leaks] == values
+        if error == 0.04:
+            assert "it would be -0.16 Hz" in found.leaks[1]["reason"]
+            assert found.dark["value"] == pytest.approx(0.1) and found.growth["value"] == pytest.approx(0.1)
+        else:
+            assert found.dark["value"] < 0.1
 
 
 def slices_tally(per_slice):
     """Counts of 20 slices of a recording of 40 pixels and 2 s."""
     slices = np.zeros((2, SLICES, GROUPS))
     slices[0, :, 3], slices[1, :, 5] = np.asarray(per_slice) * 0.75, np.asarray(per_slice) * 0.25
-    return SimpleNamespace(slices=slices, pixels=PIXELS, seconds=2.0, waves=np.zeros((2, SLICES)))
+    return SimpleNamespace(slices=slices, pixels=PIXELS, seconds=2.0, waves=np.zeros((2, SLICES)),
+                           period_s=lambda: None)  # fmt: skip
 
 
 def test_a_scene_is_not_still_beyond_half_of_its_rate_or_a_burst():
@@ -174,6 +205,19 @@ def test_a_scene_is_not_still_beyond_half_of_its_rate_or_a_burst():
         high = next(c for c in range(400, 4000, 4) if c > stats.poisson.isf(1e-3 / 20, 3 * (19 * 400 + c) / 20))
         burst[9] = 4 * round(factor * high / 4)
         assert (still.not_still(slices_tally(burst)) is not None) is is_told
+
+
+@pytest.mark.parametrize(("turns", "period", "lamp", "is_seen"), [
+    ((200, 100), 0.83, None, True), ((200, 99), 0.83, None, False), ((200, 100), None, None, False),
+    ((200, 100), 0.01, "a lamp", False),
+])  # fmt: skip
+def test_pixels_that_see_a_steady_change_are_of_no_still_scene(monkeypatch, turns, period, lamp, is_seen):
+    monkeypatch.setattr(still, "of_a_lamp", lambda tally: lamp)
+    one = slices_tally(np.full(20, 4000.0))
+    one.period_s, one.turns_us = lambda: period, [np.ones(count) for count in turns]
+    assert (still.moving(one) is not None) is is_seen
+    told = still.not_still(one)
+    assert told == lamp if not is_seen else "turn from OFF to ON events every 0.83 s" in told
 
 
 def test_on_events_of_one_phase_are_those_of_a_lamp():
@@ -245,7 +289,7 @@ def test_a_leak_follows_a_line_weighted_by_both_kinds_of_error():
         own = np.sqrt(19 / 20 * np.sum((fit[1:] - fit[1:].mean()) ** 2))
         assert told["value"] == pytest.approx(fit[0]) and told["unit"] == unit
         assert told["standard_error"] == pytest.approx(np.sqrt(own**2 + np.sum((row * unknown[:3]) ** 2)))
-    assert "at 1 lights" in still._line(leak, unknown, known, [5.0, 5.0, 5.0, 1.0])[0]["reason"]
+    assert "at one light;" in still._line(leak, unknown, known, [5.0, 5.0, 5.0, 1.0])[0]["reason"]
 
 
 def test_leaks_without_a_ratio_are_known_where_off_events_hardly_count():

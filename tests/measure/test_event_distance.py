@@ -299,10 +299,21 @@ def test_bad_input_is_one_clear_error():
         event_statistics(EventStream.of(few, SHAPE, "few"))
     with pytest.raises(SpecError, match="short: lasts 99 µs; expected 40000"):
         event_statistics(EventStream.of(made(np.arange(100), few["x"], few["polarity"]), SHAPE, "short"))
-    one = poisson(1)
-    other = EventStream.of(made(rng.integers(0, 10**6, 5000), rng.integers(0, 100, 5000), np.ones(5000, int)), (31, 40))
-    with pytest.raises(SpecError, match="is of 40x31 px; expected 37x31"):
-        event_distances(one, event_statistics(other))
+
+
+def test_sensors_of_other_sizes_are_compared_pixel_by_pixel():
+    """Random events at 6 Hz a pixel of 12x50 and of 31x37 pixels: no figure differs; at 6 and 9 Hz, ln 1.5 does."""
+    rng = np.random.default_rng(6)
+    several = []
+    for shape, hz in (((50, 12), 6.0), ((37, 31), 6.0), ((37, 31), 9.0)):
+        pixels = shape[0] * shape[1]
+        count = rng.poisson(hz * pixels * 20)
+        events = made(rng.integers(0, 20 * 10**6, count), rng.integers(0, 12, count), rng.choice([-1, 1], count))
+        events["x"], events["y"] = rng.integers(0, shape[1], count), rng.integers(0, shape[0], count)
+        several.append(event_statistics(EventStream.of(events, shape)))
+    alike, other = (event_distances(several[0], one) for one in several[1:])
+    assert sum(one.differs for one in alike) <= 1  # of seven, with a chance of 0.05 each
+    assert other[0].value == pytest.approx(np.log(1.5), abs=0.03) and other[0].differs
 
 
 def test_neighbours_that_are_active_together_more_often_than_by_chance_correlate():

@@ -296,21 +296,32 @@ def test_errors_of_lit_and_dark_checks_are_sums_of_squares_by_hand():
 
 
 def test_what_rows_and_columns_share_is_compared_by_means_over_the_exposures():
-    """Errors of both means and of the fit; of two exposures, whose scatter tells too little, twice that of the fit."""
+    """Errors of both means and of the fit: by the scatter of three exposures, but no less than each pair's own, which
+    is all that two exposures tell.
+    """
     t = np.array([0.001, 0.004, 0.004, 0.009])
     row, col = (
         np.array([[1.0, 2.0, 7.0, 1.6], [1.5, 2.5, 9.0, 2.9]]),
         np.array([[0.1, 0.7, 3, 0.3], [0.2, 0.4, 5, 0.9]]),
     )
-    real, twin = (SimpleNamespace(dark=SimpleNamespace(exposure_s=t, row=row[k], col=col[k])) for k in (0, 1))
+    own = np.array([0.7, 0.2, 9.0, 0.4])
+    real, twin = (
+        SimpleNamespace(dark=SimpleNamespace(exposure_s=t, row=row[k], col=col[k], row_error=own, col_error=1.3 * own))
+        for k in (0, 1)
+    )
     result = SimpleNamespace(row=(0.0, 0.11), col=(0.0, 0.23))
-    for check, values, fitted in zip(comparison._shared(result, real, twin), (row, col), (0.11, 0.23), strict=True):
+    mean = (0.49 + 0.04 + 0.16) / 3
+    for check, values, fitted, each in zip(
+        comparison._shared(result, real, twin), (row, col), (0.11, 0.23), (mean, 1.69 * mean), strict=True
+    ):
         some = values[:, [0, 1, 3]]
-        wanted = np.sqrt(np.sum(some.var(axis=1, ddof=1) / 3) + fitted**2)
+        wanted = np.sqrt(np.sum(np.maximum(some.var(axis=1, ddof=1), each) / 3) + fitted**2)
         assert check.error == pytest.approx(wanted) and check.freedom == np.inf and check.places.shape == (1,)
         assert (check.real[0], check.twin[0]) == pytest.approx(tuple(some.mean(axis=1)))
     real.dark.exposure_s = twin.dark.exposure_s = np.array([0.001, 0.004, 0.004, 0.004])
-    assert [check.error[0] for check in comparison._shared(result, real, twin)] == pytest.approx([0.22, 0.46])
+    two = (0.49 + 0.04) / 2  # of the mean of two pairs, for captures and twin
+    wanted = [np.sqrt(two + 0.11**2), np.sqrt(1.69 * two + 0.23**2)]
+    assert [check.error[0] for check in comparison._shared(result, real, twin)] == pytest.approx(wanted)
 
 
 def test_spatial_checks_are_relative_to_each_ones_own_signal(monkeypatch):

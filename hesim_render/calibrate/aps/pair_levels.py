@@ -45,6 +45,7 @@ class Levels:
     row_error, col_error : their standard errors.
     squares : mean over pixels of the squared variance of one pixel, DN⁴.
     low, high : part of the pixels at 0 and at full scale; of `both_levels` without those that are stuck there.
+    missing : grey values that no frame has, though many pixels of one have those on both sides.
     """
 
     exposure_s: NDArray[np.float64]
@@ -60,11 +61,17 @@ class Levels:
     squares: NDArray[np.float64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
+    missing: tuple[int, ...] = ()
 
     @property
     def clear(self) -> NDArray[np.bool_]:
         """Series clear of both ends of the ADC's range."""
         return (self.low <= CLIPPED_SHARE) & (self.high <= CLIPPED_SHARE)
+
+    @property
+    def least_variance(self) -> float:
+        """Least variance as measured, DN²: noise that rows and columns share moves values over edges as well."""
+        return float(np.min(self.variance + np.maximum(self.row, 0.0) + np.maximum(self.col, 0.0)))
 
 
 def pair_levels(pairs: PairSet, series: tuple[Series, ...], progress: Progress | None = None) -> Levels:
@@ -78,18 +85,22 @@ def pair_levels(pairs: PairSet, series: tuple[Series, ...], progress: Progress |
     full = pairs.spec.full_scale_dn
     different = list(dict.fromkeys(series))
 
-    def one(entry: Series) -> tuple[tuple[float, ...], slice | None, NDArray[np.bool_]]:
+    def one(entry: Series) -> tuple[tuple[float, ...], slice | None, set[int], NDArray[np.bool_]]:
         first, second = pairs.frames(entry)
         result = pair_statistics(first, second, full)
         _check(entry, result, first, second, full)
-        return result, _hole(first, full), np.bincount(first.ravel(), minlength=full + 1) > 0
+        low, absent, _ = _absent(first, full)
+        present = np.bincount(first.ravel(), minlength=full + 1) > 0
+        return result, _hole(first, full), set((low + np.flatnonzero(absent)).tolist()), present
 
     seen = np.zeros(full + 1, np.bool_)
+    missing: set[int] = set()
     with ThreadPoolExecutor(2) as two:
         results, holes = [], []
-        for number, (measured, hole, present) in enumerate(two.map(one, different)):
+        for number, (measured, hole, lacking, present) in enumerate(two.map(one, different)):
             results.append(measured)
             holes.append(hole)
+            missing |= lacking
             seen |= present
             if progress is not None:
                 progress("reading pairs", (number + 1) / len(different))
@@ -101,7 +112,8 @@ def pair_levels(pairs: PairSet, series: tuple[Series, ...], progress: Progress |
             )
     result = dict(zip(different, results, strict=True))
     photons = [0.0 if not s.lit else np.nan if s.photons is None else s.photons for s in series]
-    return levels([s.exposure_s for s in series], photons, [result[s] for s in series])
+    outcome = levels([s.exposure_s for s in series], photons, [result[s] for s in series])
+    return replace(outcome, missing=tuple(sorted(k for k in missing if not seen[k])))
 
 
 def both_levels(pairs: PairSet, progress: Progress | None = None) -> tuple[Levels, Levels]:

@@ -33,7 +33,7 @@ from hesim_render.calibrate.aps.long_series import (
 )
 from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
 from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, Levels, both_levels, require_one_colour
-from hesim_render.calibrate.aps.rounded_noise import RoundedNoise, rounded_noise
+from hesim_render.calibrate.aps.rounded_noise import RoundedNoise, rounded_noise, without_rounding
 from hesim_render.calibrate.aps.spatial import Pattern, outliers, pattern_of
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance
 from hesim_render.calibrate.estimate import Z_95
@@ -119,7 +119,7 @@ class PairCalibration:
     @property
     def dark_noise_is_rounded_off(self) -> bool:
         """Whether rounding hides the dark noise (EMVA 1288 R4.0: a measured variance below 0.24 DN²)."""
-        return bool(np.min(self.dark.variance + np.maximum(self.dark.row, 0.0)) < _LEAST_DARK_DN2)
+        return self.dark.least_variance < _LEAST_DARK_DN2
 
     @cached_property
     def rounded_noise(self) -> RoundedNoise | None:
@@ -166,6 +166,8 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     pairs = pairs.with_long_at(_LONG_AT * float(light[min(saturation, light.size - 1)]))
     long_dark, long_lit = long_series(pairs, progress)
     require_dark_noise(pairs, dark, long_dark)
+    if dark.least_variance >= _LEAST_DARK_DN2:
+        dark, long_dark = without_rounding(dark, long_dark)
     require_series_below_well(pairs, long_lit, lit, saturation)
     require_one_colour(pairs.spatial_lit, long_lit.mean - long_dark.mean)
     top = float(signal[min(saturation, signal.size - 1)])

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_law
 
 from hesim_render.calibrate.aps.long_series import stuck_pixels
+from hesim_render.calibrate.aps.pair_levels import Levels
 from hesim_render.calibrate.aps.pairs import PairCalibration
 from hesim_render.calibrate.estimate import ALARM, Finding
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, polynomial
 from hesim_render.recording.pair_set import light_of_series
 
 #: Relative changes of signal and variance from which a finding names them.
 _LEAST_BEND, _LEAST_SCATTER = 2e-3, 2e-3
 #: Change of the dark level from which a finding names it, DN.
 _LEAST_LEVEL_DN = 0.01
+#: Correlation of the deviations of successive levels from which they lie on a curve of their own, and fewest levels.
+_ALIKE, _FEWEST_ALIKE = 0.45, 8
+#: Missing codes that are listed.
+_MOST_CODES = 6
 #: Standard errors that chance exceeds in one of 10,000 cases.
 SIGNIFICANT = 3.9
 
@@ -39,14 +46,29 @@ def findings(result: PairCalibration) -> list[Finding]:
         )
         outcome.append(("light offset", text))
     if curve.light_rms > _LEAST_SCATTER / 4:
-        outcome.append(("light", f"the light scatters by {100 * curve.light_rms:.2g} % from exposure to exposure"))
+        amount = f"{100 * curve.light_rms:.2g} %"
+        text = f"the light scatters by {amount} from exposure to exposure"
+        if _are_alike(result.signal[result.clear] / curve.at(result.light[result.clear]) - 1):
+            text = (
+                f"the mean lies {amount} off the curve of three terms, at neighbouring lights to one side: a full well "
+                "that bends the signal long before its end, or light that drifts"
+            )
+        outcome.append(("light", text))
     outcome += _of_the_long_series(result)
     if result.level_rms > _LEAST_SCATTER and result.level_chance < ALARM:
+        amount = f"{100 * result.level_rms:.2g} %"
         text = (
-            f"the variances of single levels scatter by {100 * result.level_rms:.2g} % about the polynomial, more than "
-            f"chance (χ²/dof {result.level_chi2:.1f}): steps of the ADC that are not even, or noise that comes and goes"
+            f"the variances of single levels scatter by {amount} about the polynomial, more than chance (χ²/dof "
+            f"{result.level_chi2:.1f}): steps of the ADC that are not even, or noise that comes and goes"
         )
+        if _are_alike(_variance_residual(result)):
+            text = (
+                f"the variances lie on another curve than the polynomial of the model, {amount} off it (χ²/dof "
+                f"{result.level_chi2:.1f}): as where a full well bends the signal long before its end, or where steps "
+                "of the ADC are not even"
+            )
         outcome.append(("variance", text))
+    outcome += missing_codes(result.lit, result.dark)
     for name, (variance, error) in (("row noise", result.row), ("column noise", result.col)):
         if variance > SIGNIFICANT * error:
             rms = float(np.sqrt(variance))
@@ -73,6 +95,33 @@ def findings(result: PairCalibration) -> list[Finding]:
     outcome += _of_lag(result)
     outcome += _of_the_set(result)
     return [Finding(check, text, None) for check, text in outcome]
+
+
+def missing_codes(*levels: Levels) -> list[tuple[str, str]]:
+    """Grey values that the ADC never gives."""
+    codes = sorted({code for one in levels for code in one.missing})
+    if not codes:
+        return []
+    shown = ", ".join(str(code) for code in codes[:_MOST_CODES]) + (" and others" if len(codes) > _MOST_CODES else "")
+    text = (
+        f"no frame has the grey value {shown}, though many pixels have those beside it: a missing code of the ADC, or "
+        "frames that were changed after it. Means and variances of levels near it are off, of any twin as well"
+    )
+    return [("missing code", text)]
+
+
+def _variance_residual(result: PairCalibration) -> NDArray[np.float64]:
+    """Deviations of the lit variances from their polynomial, in standard errors."""
+    use = result.clear
+    expected = polynomial(result.fit.beta, result.signal[use], result.lit.exposure_s[use]) + ADC_VARIANCE_DN2
+    return np.asarray((result.lit.variance[use] - expected) / result.lit.error[use])
+
+
+def _are_alike(residual: NDArray) -> bool:
+    """Whether deviations of successive levels have one sign for the most part, which no independent ones have."""
+    if residual.size < _FEWEST_ALIKE:
+        return False
+    return float(residual[1:] @ residual[:-1]) > _ALIKE * float(residual @ residual)
 
 
 def _level_change(result: PairCalibration) -> float:
@@ -138,7 +187,7 @@ def _of_the_set(result: PairCalibration) -> list[tuple[str, str]]:
         outcome.append(("stuck pixels", text))
     if result.dark_noise_is_rounded_off:
         text = (
-            f"the dark variance is down to {result.dark.variance.min():.3f} DN², below the 0.24 of EMVA 1288: rounding "
+            f"the dark variance is down to {result.dark.least_variance:.3f} DN², below the 0.24 of EMVA 1288: rounding "
             "hides the dark noise, which has an upper limit alone. Capture with more bits or a higher gain"
         )
         outcome.append(("dark noise", text))

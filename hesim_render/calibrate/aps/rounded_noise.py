@@ -4,10 +4,14 @@ A dark pixel with its own level μ and noise σ has the grey value k with the ch
 Over the pixels μ is normal, with mean m and deviation s. Mean and variance of all values follow from m and τ² = σ² + s²
 alone, and give these two. The mean over pixels of each one's variance over the frames then rises with σ from 0, as only
 pixels whose level is near the edge of a step change their value. Sheppard's 1/12 holds for none of these.
+
+Where the noise is larger, Sheppard's 1/12 nearly holds. With e = exp(−2π²σ²), to the first order in e, the mean of a
+rounded value is μ − e sin(2πμ)/π, and its variance σ² + 1/12 − e (4σ² + 1/π²) cos(2πμ).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +19,10 @@ from numpy.typing import NDArray
 from scipy import optimize, special
 
 from hesim_render.calibrate.aps.long_series import Long
+from hesim_render.calibrate.aps.pair_levels import Levels
+from hesim_render.calibrate.aps.spatial import spatial_variance
 from hesim_render.calibrate.estimate import Z_95
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 
 #: Groups of rows of the jackknife.
 _GROUPS = 20
@@ -30,6 +37,12 @@ _LAWS = [
     np.exp(-np.sqrt(2) * np.abs(_PLACES)),
 ]
 _LAWS = [law / law.sum() for law in _LAWS]
+#: Variance, DN², from which rounding adds less than 1e-4 of it to 1/12.
+_NO_TRACE_DN2 = 0.6
+#: Sines are made larger by no more than the inverse of this.
+_LEAST_FADE = 0.05
+#: Rounds in which noise and what rounding makes of it are found from each other.
+_ROUNDS = 8
 #: Values of σ over τ between which the estimate lies.
 _PARTS = np.linspace(0.0, 1.0, 51)
 
@@ -92,6 +105,37 @@ def rounded_noise(series: Long, defects: NDArray[np.bool_]) -> RoundedNoise | No
     low, high = value - float(np.hypot(below, chance)), value + float(np.hypot(above, chance))
     spread = float(np.sqrt(max(deviation**2 - value**2, 0.0)))
     return RoundedNoise(value, error, max(low, 0.0), high, spread)
+
+
+def without_rounding(dark: Levels, series: Long) -> tuple[Levels, Long]:
+    """Dark variances, and the means of a dark series, without what rounding adds beyond 1/12 DN².
+
+    Of noise above 0.4 DN; below, that law does not hold. Where the noise is so large that it adds nothing, both are
+    those given.
+    """
+    part = series.temporal
+    whole = part.pixel + sum(max(value, 0.0) for value in (part.row, part.col, part.frame))
+    if min(whole, dark.least_variance) > _NO_TRACE_DN2:
+        return dark, series
+    # the noise of the mean over the frames makes its sines smaller
+    fades = max(float(np.exp(-2 * np.pi**2 * whole / series.frames)), _LEAST_FADE)
+    noise, mean, places, bend = whole - ADC_VARIANCE_DN2, series.mean, 0j, 0.0
+    for _ in range(_ROUNDS):
+        bend = float(np.exp(-2 * np.pi**2 * noise))
+        mean = series.mean + bend / (np.pi * fades) * np.sin(2 * np.pi * series.mean)
+        places = complex(np.mean(np.exp(2j * np.pi * mean))) / fades
+        noise = whole - ADC_VARIANCE_DN2 + bend * places.real * (4 * noise + 1 / np.pi**2)
+    # of each level, whose places are those of the series moved by its mean
+    along = np.real(places * np.exp(2j * np.pi * (dark.mean - series.mean.mean())))
+    own, shared = dark.variance - ADC_VARIANCE_DN2, np.maximum(dark.row, 0.0) + np.maximum(dark.col, 0.0)
+    less = np.zeros_like(along)
+    for _ in range(_ROUNDS):
+        less = along * np.exp(-2 * np.pi**2 * (own + shared * (1 + 4 * less)))
+        own = dark.variance - ADC_VARIANCE_DN2 + less * (4 * own + 1 / np.pi**2)
+    free = replace(dark, variance=own + ADC_VARIANCE_DN2, row=dark.row * (1 + 4 * less), col=dark.col * (1 + 4 * less))
+    temporal = replace(part, pixel=part.pixel * (1 + 4 * bend * places.real))
+    spatial = spatial_variance(mean, temporal, series.frames, series.variance)
+    return free, replace(series, mean=mean, spatial=spatial)
 
 
 def levels_of(mean: NDArray[np.float64], good: NDArray[np.bool_], spread: float, seed: int = 1) -> NDArray[np.float64]:

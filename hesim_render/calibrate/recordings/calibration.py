@@ -33,6 +33,7 @@ def calibrate_recordings(
     target_contrast: float | None = None,
     target_hz: float | None = None,
     shape: tuple[int, int] | None = None,
+    first: tuple[int, int] = (0, 0),
     overwrite: bool = False,
     progress: Callable[[str, float], None] | None = None,
 ) -> dict[str, Any]:
@@ -47,6 +48,7 @@ def calibrate_recordings(
     target_contrast : light of its bright parts over that of its dark ones.
     target_hz : bright–dark cycles that a pixel sees per second; None: read from the recording.
     shape : rows and columns of the sensor, px, where a file does not state them.
+    first : row and column on the sensor of the recordings' first pixel: odd rows of a crop may be even ones there.
     overwrite : replace `out`.
     progress : called with what is being done, and the part that is done.
 
@@ -75,11 +77,14 @@ def calibrate_recordings(
         if tallies and stream.shape != tallies[0].shape:
             (rows, cols), (first_rows, first_cols) = stream.shape, tallies[0].shape
             raise SpecError(f"is of {cols}x{rows} px; expected {first_cols}x{first_rows}, as {names[0]}", file=name)
+        if any(first) and shape not in (None, stream.shape):
+            problem = f"is of {stream.shape[1]}x{stream.shape[0]} px, not of the crop's {shape[1]}x{shape[0]}"
+            raise SpecError(f"{problem}; where it counts the pixels of the whole sensor, leave out the crop", file=name)
         tallies.append(tally(stream))
     report("fit", len(every) / (len(every) + 1))
     moving = tallies.pop() if target_file is not None else None
     result = figures(
-        tallies, moving, None if lux is None else [float(level) for level in lux], target_contrast, target_hz
+        tallies, moving, None if lux is None else [float(level) for level in lux], target_contrast, target_hz, first
     )
     if path is not None:
         with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8") as file:
@@ -111,6 +116,7 @@ def figures(
     lux: Sequence[float] | None,
     contrast: float | None,
     cycles_hz: float | None,
+    first: tuple[int, int] = (0, 0),
 ) -> dict[str, Any]:
     """The result of `calibrate_recordings` for tallies of still scenes and of a moving target, if there is one."""
     every = [*tallies, *([moving] if moving is not None else [])]
@@ -127,7 +133,7 @@ def figures(
             one.used &= ~hot
     of_target = target.unknown("it takes a recording of a moving target (--target)")
     # levels are balanced where the light and the camera are steady
-    steady = [k for k, one in enumerate(tallies) if still.unsteady(one) is None]
+    steady = [k for k, one in enumerate(tallies) if not (still.unsteady(one) or still.moving(one))]
     calm, calm_lux = [tallies[k] for k in steady], None if lux is None else [lux[k] for k in steady]
     result = still.balance(calm, calm_lux)
     if moving is not None and contrast is not None:
@@ -137,9 +143,10 @@ def figures(
             if of_target.ratio["value"] is None:
                 break
             result = still.balance_with_target(calm, calm_lux, moving, of_target.ratio, leak_hz)
-            if not calm:
+            known = [leak["value"] for leak in result.leaks if leak["value"] is not None]
+            if not known:
                 break
-            leak_hz = float(np.mean([leak["value"] for leak in result.leaks]))
+            leak_hz = max(float(np.mean(known)), 0.0)
     entries, findings = [], []
     leaks, changes = dict(zip(steady, result.leaks, strict=True)), not_identifiable("its rate changes (findings)")
     for k, one in enumerate(tallies):
@@ -153,9 +160,11 @@ def figures(
         if problem := still.not_still(one):
             findings.append({"file": Path(one.source).name, "text": problem})
     return {
-        "sensor": {"rows": tallies[0].shape[0], "cols": tallies[0].shape[1]},
+        "sensor": {
+            "rows": tallies[0].shape[0], "cols": tallies[0].shape[1], "first_row": first[0], "first_col": first[1],
+        },
         "recordings": entries, "threshold_ratio": result.ratio, **of_target.entries, "leak_dark_hz": result.dark,
-        "leak_growth_hz_per_lux": result.growth, "noise_spread": surest([noise_spread(one) for one in calm]),
+        "leak_growth_hz_per_lux": result.growth, "noise_spread": surest([noise_spread(one, first) for one in calm]),
         "hot_share": still.hot_share(tallies), "silent_share": still.silent_share(tallies),
         "dead_time_us": _dead_time(tallies, moving), "readout_limit_events_per_s": limit, "findings": findings,
     }  # fmt: skip

@@ -40,11 +40,16 @@ _EVENTS_OF_HALF, _MOST_RATIO = 5.0, 2.0
 KEYS = ("bandwidth_rel", "odd_rows_rel", "odd_cols_rel")
 
 
-def noise_spread(tally: EventTally) -> dict[str, dict[str, Any]]:
+def noise_spread(tally: EventTally, first: tuple[int, int] = (0, 0)) -> dict[str, dict[str, Any]]:
     """Keys of ``evs.noise_spread``, each with its interval, a jackknife over groups of pixels.
 
     ``bandwidth_rel`` is s, apart from the pattern; odd rows have ``1 + odd_rows_rel`` times the bandwidth, even ones
     ``1 − odd_rows_rel``, columns likewise. Light must be even: what differs in it makes rates differ.
+
+    Parameters
+    ----------
+    tally : of the recording.
+    first : row and column of its first pixel on the sensor; of a crop, whose odd rows may be even ones there.
     """
     counts = tally.counts.reshape(4, -1).astype(np.float64)
     means = counts[:, tally.used].mean(axis=1)
@@ -55,7 +60,7 @@ def noise_spread(tally: EventTally) -> dict[str, dict[str, Any]]:
     if not 1 / _MOST_RATIO < on / off < _MOST_RATIO:
         return _none(f"there are {on / off:.2g} ON events for an OFF event, so that not noise alone makes them: record "
                      "in dimmer light")  # fmt: skip
-    sums = _sums(tally, counts)
+    sums = _sums(tally, counts, first)
     every = np.concatenate([sums.sum(axis=2, keepdims=True), sums.sum(axis=2, keepdims=True) - sums], axis=2)
     if every[0].min() < 2:
         return _none("even or odd rows or columns have too few pixels")
@@ -103,14 +108,14 @@ def _none(reason: str) -> dict[str, dict[str, Any]]:
     return dict.fromkeys(KEYS, not_identifiable(reason))
 
 
-def _sums(tally: EventTally, counts: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sums(tally: EventTally, counts: NDArray[np.float64], first: tuple[int, int]) -> NDArray[np.float64]:
     """Sums over pixels of even or odd rows and columns, [sum, class, group of pixels].
 
     They are the pixels, the counts [polarity, half] and the products of counts of different halves: of ON, of OFF, and
     of both ways of ON and OFF.
     """
     row, col = np.divmod(np.arange(tally.pixels), tally.shape[1])
-    place = ((row % 2 * 2 + col % 2) * GROUPS + tally.group.astype(np.int64))[tally.used]
+    place = (((row + first[0]) % 2 * 2 + (col + first[1]) % 2) * GROUPS + tally.group.astype(np.int64))[tally.used]
     on_on, off_off = counts[0] * counts[1], counts[2] * counts[3]
     values = [np.ones(tally.pixels), *counts, on_on, off_off, counts[0] * counts[3], counts[1] * counts[2]]
     sums = [np.bincount(place, one[tally.used], 4 * GROUPS).reshape(4, GROUPS) for one in values]

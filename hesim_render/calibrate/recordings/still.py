@@ -29,12 +29,16 @@ _BURST_CHANCE = 1e-3
 _LEAST_FLICKER, _FLICKER_POWER = 0.1, 4.0
 #: Periods of a lamp in a slice of a recording that tells it.
 _LEAST_PERIODS = 2.0
+#: Turns from OFF to ON events that tell a period.
+_FEWEST_TURNS = 300
 #: Relative standard deviation of thresholds over pixels, where none was measured.
 USUAL_MISMATCH = 0.1
 #: Shift of ρ, and of a leak over ρ n₋, in squares of the mismatch.
 _RATIO_SHIFT, _LEAK_SHIFT = 1.0, 3.0
 #: Relative error of the leak in the light of a moving target.
 UNSURE_LEAK = 0.1
+#: Standard errors below 0 from which a leak is none.
+_BELOW_0 = 3.0
 #: Range in which the ratio of the thresholds is taken to be where nothing tells it.
 _RATIO = (0.5, 2.0)
 
@@ -158,7 +162,13 @@ def _with_ratio(
 ) -> LeakBalance:
     errors = np.hypot(jackknife(leak), unknown)
     leaks = [estimated(one[0], float(error), "Hz", GROUPS) for one, error in zip(leak, errors, strict=True)]
-    return LeakBalance(ratio, leaks, *_line(leak, unknown, np.ones(len(leak), np.bool_), lux))
+    known = leak[:, 0] > -_BELOW_0 * errors
+    for k in np.flatnonzero(~known):
+        leaks[k] = not_identifiable(
+            f"the levels do not balance: it would be {leak[k, 0]:.3g} Hz, and a leak makes ON events. The "
+            "reference does not follow its events by whole thresholds, as where noise is fast beside the dead time"
+        )
+    return LeakBalance(ratio, leaks, *_line(leak, unknown, known, lux))
 
 
 def _leak_alone(rates: NDArray[np.float64], why: str) -> dict[str, Any]:
@@ -197,7 +207,8 @@ def _line(
         return reason, reason
     level = np.asarray(lux, np.float64)[known]
     if np.unique(level).size < 2:
-        reason = not_identifiable(f"the leak is known at {np.unique(level).size} lights; two are needed")
+        at = "one light" if known.any() else "no light"
+        reason = not_identifiable(f"the leak is known at {at}; two are needed")
         return reason, reason
     weight = 1 / np.maximum(np.hypot(jackknife(leak[known]), unknown[known]), 1e-12)
     # the line as a matrix on the leaks, so that errors go through it
@@ -225,14 +236,21 @@ def share(count: int, of: int) -> dict[str, Any]:
 
 
 def hot_pixels(tallies: Sequence[EventTally]) -> NDArray[np.bool_]:
-    """Pixels [pixel] with many more ON events than the others, in each recording."""
-    hot = np.ones(tallies[0].pixels, np.bool_)
-    for one in tallies:
-        count = one.per_pixel()[0]
-        # mean of the lower nine tenths, which hot pixels do not change
-        usual = float(np.sort(count)[: max(1, round(0.9 * count.size))].mean()) + 1 / count.size
-        hot &= count > stats.poisson.isf(_HOT_CHANCE / count.size, _HOT * usual)
-    return hot
+    """Pixels [pixel] with many more ON events than the others, in each recording that can show it.
+
+    Where the others are so busy that a pixel of that rate would not stand out, it has half of that rate at least.
+    """
+    counts = np.array([one.per_pixel()[0] for one in tallies])
+    seconds = np.array([one.seconds for one in tallies])[:, None]
+    # mean of the lower nine tenths, which hot pixels do not change
+    lower = np.sort(counts, axis=1)[:, : max(1, round(0.9 * counts.shape[1]))]
+    usual = lower.mean(axis=1, keepdims=True) + 1 / counts.shape[1]
+    limit = stats.poisson.isf(_HOT_CHANCE / counts.shape[1], _HOT * usual)
+    stands_out = counts > limit
+    rate_hz = counts / seconds
+    least_hz = np.where(stands_out, rate_hz, np.inf).min(axis=0)
+    hidden = (least_hz * seconds <= limit) & (rate_hz >= 0.5 * least_hz)
+    return np.asarray(stands_out.any(axis=0) & np.all(stands_out | hidden, axis=0))
 
 
 def hot_share(tallies: Sequence[EventTally]) -> dict[str, Any]:
@@ -279,7 +297,20 @@ def unsteady(tally: EventTally) -> str | None:
 
 def not_still(tally: EventTally) -> str | None:
     """A line that says that a recording is not one of a still scene in steady light; None where it may be."""
-    return unsteady(tally) or of_a_lamp(tally)
+    return unsteady(tally) or of_a_lamp(tally) or moving(tally)
+
+
+def moving(tally: EventTally) -> str | None:
+    """A line that says that the pixels see their light change again and again, at a steady rate; None where they do
+    not, or a lamp does it.
+    """
+    period_s = tally.period_s()
+    if period_s is None or sum(one.size for one in tally.turns_us) < _FEWEST_TURNS or of_a_lamp(tally) is not None:
+        return None
+    return (
+        f"most of its pixels turn from OFF to ON events every {period_s:.3g} s: a target that moves by, or light that "
+        "changes; a target is given by --target"
+    )
 
 
 def of_a_lamp(tally: EventTally) -> str | None:

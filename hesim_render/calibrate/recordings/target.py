@@ -89,6 +89,8 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     over = course.ends @ fitted[:2] / swing
     beside = fitted * np.append(unsure, 0.0)
     errors = np.sqrt(jackknife(every) ** 2 + np.diag(of_simulated) + beside**2)
+    if not np.all(np.isfinite([fitted, errors])):
+        return unknown("no thresholds give the counts of this target: its contrast is another, or noise is too strong")
     entries = {
         name: _widened(estimated(value, error, "ln", GROUPS), over)
         for name, value, error in zip(("theta_on", "theta_off"), fitted[:2], errors[:2], strict=True)

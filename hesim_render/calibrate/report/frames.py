@@ -25,6 +25,7 @@ def aps_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
     band = np.repeat(n_row[:, None], max(8, len(n_row) // 3), axis=1)
     step = max(1, len(n_row) // 320)
     exposure = float(maps["figure_variance_exposure_us"]) / 1000
+    of_pairs = _is_of_pairs(section)
     return filled(
         "calibrate/report/frames.html",
         headline=headline(section),
@@ -34,7 +35,11 @@ def aps_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
             _profile(n_row),
             picture(f"Temporal variance per pixel, lit, {exposure:g} ms", maps["figure_variance_map"], "DN²", 330),
         ),
-        histograms=[_histogram(name, maps[f"figure_noise_{name}"]) for name in ("dark", "lit")],
+        histograms=[
+            _histogram(f"{name}, {'long series' if of_pairs else 'longest exposure'}", maps[f"figure_noise_{name}"])
+            for name in ("dark", "lit")
+        ],
+        points="of a pair of frames each" if of_pairs else "pooled, one colour an exposure",
         variances=_variance_panels(section, maps["figure_variance_points"]),
         head=HEAD,
         parameters=_transfer_rows(section),
@@ -53,9 +58,7 @@ def _profile(n_row: NDArray) -> str:
 
 def _histogram(name: str, values: NDArray) -> str:
     x, measured, predicted = values.T
-    figure, axes = panel(
-        f"Noise of single values, {name}, longest exposure", "deviation from the mean, DN", "density, 1/DN"
-    )
+    figure, axes = panel(f"Noise of single values, {name}", "deviation from the mean, DN", "density, 1/DN")
     half = (x[1] - x[0]) / 2 if len(x) > 1 else 0.5
     axes.stairs(measured, np.append(x - half, x[-1] + half), fill=True, color=COLOURS[0], alpha=0.35, label="measured")
     axes.plot(x, predicted, color=COLOURS[1], label="predicted")
@@ -95,10 +98,17 @@ def _variance_panel(title: str, beta: NDArray, here: NDArray) -> str:
     return svg(figure)
 
 
+def _is_of_pairs(section: dict[str, Any]) -> bool:
+    """Whether it was found from captures of EMVA 1288."""
+    return "quantum_efficiency" in section
+
+
 def _transfer_rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
+    of_pairs = _is_of_pairs(section)
     names = {
         "K": "K, system gain (EMVA 1288)", "read_noise_e": "read noise", "dark_current_e_per_s": "dark current",
-        "full_well_e": "saturation capacity", "dsnu_e": "DSNU (without rows)", "prnu_percent": "PRNU",
+        "full_well_e": "saturation capacity", "prnu_percent": "PRNU",
+        "dsnu_e": "DSNU" if of_pairs else "DSNU (without rows)",
         "linearity_error_percent": "linearity error", "row_noise_dn": "temporal row noise",
         "quantum_efficiency": "quantum efficiency", "responsivity": "responsivity",
         "temporal_dark_noise_e": "temporal dark noise (EMVA 1288)", "column_noise_dn": "temporal column noise",
@@ -108,7 +118,9 @@ def _transfer_rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
     rows += [
         ("black level", number(section["black_dn"]), "", "DN"),
         ("std of N_row", number(section["n_row_std_dn"]), "", "DN"),
-        ("hot / bad pixels", f"{section['hot_pixels']} / {section['bad_pixels']}", "", ""),
+        ("defect pixels", str(section["bad_pixels"]), "", "unlike the others in the dark or in the light")
+        if of_pairs
+        else ("hot / bad pixels", f"{section['hot_pixels']} / {section['bad_pixels']}", "", ""),
     ]
     if section.get("telegraph_pixels") is not None:
         rows.append(("pixels with telegraph noise", str(section["telegraph_pixels"]), "", "two levels"))
