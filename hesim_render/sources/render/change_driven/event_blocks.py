@@ -91,11 +91,11 @@ class Blocks:
             if first is not None and windows.size == 1:
                 parts.append((band.place, Knots.of(first, np.ones((1, band.place.size), np.bool_), centre)))
                 continue
-            numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
+            numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.sites.size))
             pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride)
             # what lies behind the last wanted window, at the end of a run, is not rendered
             what = renderer.plan(pilot, band, is_knot=True).until(int(np.flatnonzero(block.wanted)[-1]))
-            numbers = np.repeat(np.arange(windows.size)[:, None], band.place.size, axis=1)
+            numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.place.size))
             if first is None and anchor.span_us == (block.begin_us[0], block.end_us[0]):
                 first = anchor.flux_of(np.arange(band.place.size))
             if first is None:
@@ -175,18 +175,20 @@ class Knots:
         window : number of the window.
         low : last knot of each pixel up to it.
         """
-        is_knot = self.window[low] == window
-        has_next = low + 1 < self.first[1:]
-        high = np.where(has_next & ~is_knot, low + 1, low)
-        # how far the window is on the way from one knot to the next
-        begin, end = self.centre_us[self.window[low]], self.centre_us[self.window[high]]
-        part = ((self.centre_us[window] - begin) / np.where(high > low, end - begin, 1)).astype(np.float32)
-        part[high == low] = 0
+        here, has_next = self.window[low], low + 1 < self.first[1:]
+        is_knot = here == window
+        high = low + (has_next & ~is_knot)
+        # how far the window is on the way from one knot to the next, by the windows of both; 0 from a knot to itself
+        centre = self.centre_us
+        begin, span = centre[:, None], centre - centre[:, None]
+        way = ((centre[window] - begin) / np.where(span > 0, span, np.inf)).astype(np.float32)
+        part = way.ravel()[here.astype(np.int64) * centre.size + self.window[high]]
+        nothing = np.flatnonzero(~is_knot & ~has_next)
         interpolated = []
         for values in self.values:
             start = values[low]
             value = start + part * (values[high] - start)
-            value[~is_knot & ~has_next] = 0
+            value[nothing] = 0
             interpolated.append(value[None])
         return Flux(*interpolated)
 

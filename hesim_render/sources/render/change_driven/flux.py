@@ -215,7 +215,7 @@ class ChangeDrivenFlux:
         counts, done = replace(renderer.counts), self._tracer.rays_done
         later = max(1, windows.size - 1)
         for band in renderer.bands(pixel, role):
-            numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
+            numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.sites.size))
             # of the sites, some are neighbours beyond the patch
             share, before = band.place.size / band.sites.size, renderer.counts.pilot_rays
             is_compared = role == "events" and not is_anchor
