@@ -161,20 +161,24 @@ def test_random_events_without_noise_of_a_level_have_no_spread_beyond_their_limi
 
 
 def test_sums_patterns_and_covariances_are_those_of_a_loop_over_pixels():
-    """Of used pixels of 7 × 9, by even or odd row and column: counts of both halves and their products."""
+    """Of used pixels of 7 × 9, by even or odd row and column of the sensor: counts of both halves and their products.
+
+    The crop begins at row 3 and column 4.
+    """
     rng, shape = np.random.default_rng(6), (7, 9)
     counts, group = rng.integers(1, 30, (4, 63)).astype(float), rng.integers(0, GROUPS, 63)
     used = rng.random(63) < 0.9
     given = SimpleNamespace(pixels=63, shape=shape, group=group.astype(np.uint64), used=used)
-    sums = of_noise._sums(given, counts)
+    sums = of_noise._sums(given, counts, (3, 4))
     wanted = np.zeros((9, 4, GROUPS))
     for k in np.flatnonzero(used):
         on, late_on, off, late_off = counts[:, k]
         own = [1, on, late_on, off, late_off, on * late_on, off * late_off, on * late_off, late_on * off]
-        wanted[:, 2 * (k // 9 % 2) + k % 9 % 2, group[k]] += own
+        wanted[:, 2 * ((k // 9 + 3) % 2) + k % 9 % 2, group[k]] += own
     np.testing.assert_allclose(sums, wanted)
     whole = wanted.sum(axis=2, keepdims=True)
     row, col = np.divmod(np.arange(63), 9)
+    row, col = row + 3, col + 4
     total = counts.sum(axis=0)
 
     def of(is_odd_row, is_odd_col, values):
