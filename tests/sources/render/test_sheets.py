@@ -6,12 +6,20 @@ from scipy.spatial import Delaunay
 
 from hesim_render.core.backend import select
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.transport import sheets
 from hesim_render.sources.render.transport.closed_form import Part, surface_of
 from hesim_render.sources.render.transport.sheets import sheets_of
 
 COUNT = 60_000
 
 pytestmark = pytest.mark.skipif(select().backend == "cuda", reason="a GPU has units for triangles")
+
+
+@pytest.fixture(autouse=True)
+def however_they_lie(request, monkeypatch):
+    """A grid is used even if a tree of boxes were as fast."""
+    if "only" not in request.node.name:
+        monkeypatch.setattr(sheets, "_LEAST_CROWDED", 0.0)
 
 
 def mesh(vertices, triangles):
@@ -112,16 +120,28 @@ def test_hits_are_those_of_mitsuba(name):
         np.testing.assert_array_equal(np.array(some), met & np.array(asked))
 
 
+def fan(count):
+    """Points of a circle, and triangles between these, from 1 on, and its middle, 0."""
+    angle, each = np.linspace(0, 2 * np.pi, count, endpoint=False), np.arange(count)
+    rim = np.stack([0.13 * np.cos(angle), 0.13 * np.sin(angle)], axis=1)
+    return rim, np.stack([np.zeros(count, int), each + 1, (each + 1) % count + 1], axis=1)
+
+
+def test_a_grid_only_serves_triangles_whose_boxes_overlap_much():
+    """In the axes of its first side, boxes of a fan of n triangles have n/4π times the area of the box around all."""
+    for count, is_served in ((200, False), (400, True)):
+        rim, triangles = fan(count)
+        corners = np.append(np.concatenate([[[0, 0]], rim]), np.full((count + 1, 1), 0.2), axis=1)
+        assert bool(sheets_of([mesh(corners, triangles)])) == is_served
+    assert sheets_of(patches()) == []
+
+
 def test_there_is_no_gap_between_two_triangles_and_nothing_beyond_the_rim():
     """Rays through all sides and corners of a fan of thin triangles, as in the middle of a Siemens star."""
     mi, rng = mitsuba(), np.random.default_rng(8)
-    angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)
-    rim = np.stack([0.13 * np.cos(angle), 0.13 * np.sin(angle)], axis=1)
     axes, at = turned(11), np.array([0.4, -1.3, 0.2])
-    points = np.concatenate([[[0, 0]], rim])
-    each = np.arange(400)
-    triangles = np.stack([np.zeros(400, int), each + 1, (each + 1) % 400 + 1], axis=1)
-    corners = points @ axes[:, :2].T + at
+    rim, triangles = fan(400)
+    corners = np.concatenate([[[0, 0]], rim]) @ axes[:, :2].T + at
     part = Part(mi, scene_of(mesh(corners, triangles[::2]), mesh(corners, triangles[1::2])), apart=False)
     assert part._scene is None
 
@@ -195,6 +215,23 @@ def test_planes_are_told_apart():
     corners = np.array([[0, 0, 5], [1, 0, 5], [0, 1, 5], [0, 0, 2], [0, 0, 3], [0, 0, 1], [1e-6, 0, 1], [0, 1e-6, 1]])
     (sheet,) = sheets_of([mesh(corners, [[0, 1, 2], [3, 4, 5], [5, 6, 7]])])
     assert sheet.owner.tolist() == [[0, 0]]
+
+
+@pytest.mark.parametrize(("away", "above", "beside"), [(100.0, 1e-4, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.5)])
+def test_triangles_that_overlap_are_left_to_mitsuba(away, above, beside):
+    """A decal on a wall: far away, 0.1 mm are less than what coordinates of its plane are rounded by here. The same
+    twice; and squares that only touch do not overlap.
+    """
+    mi, axes = mitsuba(), np.eye(3)
+    at = np.array([away, 0.3 * away, -away])
+    back = wall(axes, at)
+    decal = np.array([[0.1, 0.1], [0.3, 0.1], [0.3, 0.2], [0.1, 0.2]])
+    decal[:, 0] += 1.4 * beside
+    front = mesh(decal @ axes[:, :2].T + at + [0, 0, above], [[0, 1, 2], [0, 2, 3]])
+    small = [mesh(corners, [[0, 1, 2]]) for corners in np.array([[[5, 5, 0], [5, 6, 0], [6, 5, 0]]] * 20) * 1.0
+             + np.arange(20)[:, None, None] * [2.0, 0, 0] + at]  # fmt: skip
+    form = Part(mi, scene_of(back, front, *small), apart=False).form
+    assert (form is None) == (beside == 0)
 
 
 def test_what_is_in_no_plane_is_left_to_mitsuba():
