@@ -268,7 +268,7 @@ def test_linear_interpolation_spreads_events():
     assert ticks["none"] <= 6 < 12 < ticks["linear"]
 
 
-@pytest.mark.parametrize(("way", "enough"), [("none", np.exp(0.21)), ("linear", 1 + 8 * np.expm1(0.21))])
+@pytest.mark.parametrize(("way", "enough"), [("none", float(np.exp(0.21))), ("linear", float(1 + 8 * np.expm1(0.21)))])
 def test_what_interpolation_loses_before_a_fixed_tick_is_told(way, enough):
     """Pictures of 8 ticks: a change between two below 1 + 8 (exp(θ) - 1) gives no event if it is spread."""
     sensor = mono(
