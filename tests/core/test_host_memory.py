@@ -10,7 +10,7 @@ from hesim_render.core.child import child_environment, python_command, with_pack
 
 _HAS_GLIBC = sys.platform == "linux" and hasattr(ctypes.CDLL(None), "gnu_get_libc_version")
 
-#: Fills 23 MB three at a time and frees them, and prints the bytes of memory that the kernel had to clear.
+#: Fills five arrays of 24 MB and frees them, twenty times, and prints how often the system had to give memory.
 _PROGRAM = """
 import resource, sys
 import numpy as np
@@ -34,6 +34,6 @@ def faults(how):
 
 @pytest.mark.skipif(not _HAS_GLIBC, reason="another library manages memory")
 def test_freed_arrays_are_used_again():
-    """Without it, 20 times 118 MB are cleared, in pages of at most 2 MB."""
+    """Without it, the system gives and clears 20 times 118 MB, in pages of at most 2 MB."""
     assert faults("freed") > 20 * 5 * 8
     assert faults("kept") < 20

@@ -160,6 +160,20 @@ def test_a_few_balls_beside_other_shapes_are_met_in_closed_form(balls, apart):
     np.testing.assert_array_equal(np.array(part.nearest(ray, False, asked)[0].is_valid()), met & np.array(asked))
 
 
+def test_balls_beside_instances_are_left_to_mitsuba():
+    """It cannot put an instance into a second scene."""
+    mi = mitsuba()
+    shapes = {"group": {"type": "shapegroup", "box": {"type": "cube", "to_world": placed(2, 0.2)}}}
+    shapes["ball"] = {"type": "sphere", "center": [0.1, -0.3, 0.2], "radius": 0.3}
+    for k in range(2):
+        move = mi.ScalarTransform4f().translate([0.4 * k, 0.1, -0.2])
+        shapes[f"copy_{k}"] = {"type": "instance", "to_world": move, "ref": {"type": "ref", "id": "group"}}
+    scene = mi.load_dict({"type": "scene", **shapes})
+    part = Part(mi, scene, apart=False)
+    assert part._scene is scene
+    assert not part._balls
+
+
 def test_masked_lanes_meet_nothing():
     mi = mitsuba()
     part = Part(mi, scene_of(*BOXES["all together"]()), apart=False)

@@ -16,10 +16,9 @@ pytestmark = pytest.mark.skipif(select().backend == "cuda", reason="a GPU has un
 
 
 @pytest.fixture(autouse=True)
-def however_they_lie(request, monkeypatch):
+def however_they_lie(monkeypatch):
     """A grid is used even if a tree of boxes were as fast."""
-    if "only" not in request.node.name:
-        monkeypatch.setattr(sheets, "_LEAST_CROWDED", 0.0)
+    monkeypatch.setattr(sheets, "_LEAST_CROWDED", 0.0)
 
 
 def mesh(vertices, triangles):
@@ -127,8 +126,9 @@ def fan(count):
     return rim, np.stack([np.zeros(count, int), each + 1, (each + 1) % count + 1], axis=1)
 
 
-def test_a_grid_only_serves_triangles_whose_boxes_overlap_much():
+def test_a_grid_only_serves_triangles_whose_boxes_overlap_much(monkeypatch):
     """In the axes of its first side, boxes of a fan of n triangles have n/4π times the area of the box around all."""
+    monkeypatch.undo()  # of `however_they_lie`
     for count, is_served in ((200, False), (400, True)):
         rim, triangles = fan(count)
         corners = np.append(np.concatenate([[[0, 0]], rim]), np.full((count + 1, 1), 0.2), axis=1)

@@ -1,10 +1,10 @@
-"""Ray intersection in closed form for rigid groups of flat faces and balls.
+"""Ray intersection in closed form for rigid groups of flat faces, balls or sheets.
 
 Targets are flat, and so are most of the surfaces around them. A few faces and balls are tested one after the other
 within the kernel, and Mitsuba's description of each face is fetched once in advance. This is faster than a search
 through a tree of boxes, for which rays leave the kernel, and than fetching corners for each hit. Groups with many
-shapes, or with shapes of another form, are intersected by Mitsuba (Embree on a CPU, OptiX on a GPU). Mitsuba evaluates
-the reflection of all surfaces.
+shapes, or with shapes of another form, are intersected by Mitsuba (Embree on a CPU, OptiX on a GPU), but for their
+balls if these are few. Mitsuba evaluates the reflection of all surfaces.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Ball:
 
 @dataclass(frozen=True)
 class SimpleForm:
-    """Faces and balls, each with its Mitsuba shape, and sheets with the meshes that they are of."""
+    """Faces and balls, each with its Mitsuba shape; or sheets, and the meshes that they are of."""
 
     faces: list[tuple[Face, MitsubaObject]]
     balls: list[tuple[Ball, MitsubaObject]]
@@ -61,14 +61,14 @@ class SimpleForm:
 
     @classmethod
     def of(cls, mi: MitsubaModule, scene: MitsubaObject) -> SimpleForm | None:
-        """The faces and balls of a scene, or its sheets and balls; None if it has other shapes, or too many."""
+        """The faces and balls of a scene, or its sheets; None if it has other shapes, or too many."""
         shapes = scene.shapes()
         balls = [shape for shape in shapes if shape.class_name() == "Sphere"]
         meshes = [shape for shape in shapes if shape.is_mesh()]
         form = cls([], [], [], meshes)
-        # known before any shape is looked at, which takes a kernel for each
+        # known before any shape is looked at, which takes a kernel
         if len(balls) + sum(mesh.face_count() for mesh in meshes) / 2 > _MOST:
-            # what a GPU's own units for triangles take was not compared
+            # on a GPU, which has units of its own for triangles, times were not compared
             if balls or len(meshes) < len(shapes) or select().backend == "cuda":
                 return None
             form.sheets.extend(sheets_of(meshes))
@@ -169,14 +169,12 @@ class Part:
             end, face = take(is_nearer, t, shape), dr.select(is_nearer, number, face)
             hit.prim_uv = dr.select(is_nearer, place, hit.prim_uv)
         for sheet in self._sheets:
-            t, is_met, place, triangle = sheet.meet(ray, active & (end > 0))
+            t, is_met, place, triangle = sheet.meet(ray, active)
             is_nearer = is_met & (t < end)
-            own_shape, prim = sheet.owner(triangle, is_nearer)
+            own_shape, own_number = sheet.owner(triangle, is_nearer)
             end = take(is_nearer, t, own_shape)
-            hit.prim_uv, hit.prim_index = (
-                dr.select(is_nearer, place, hit.prim_uv),
-                dr.select(is_nearer, prim, hit.prim_index),
-            )
+            hit.prim_uv = dr.select(is_nearer, place, hit.prim_uv)
+            hit.prim_index = dr.select(is_nearer, own_number, hit.prim_index)
         return hit, face
 
     def blocks(self, ray: Ray, active: Mask) -> Mask:
@@ -260,18 +258,15 @@ def _on_device(mi: MitsubaModule, values: NDArray[np.float64]) -> list[Any]:
     return [tuple(mi.Point2f(row) for row in value) for value in kept]
 
 
-def _is_instance(shape: MitsubaObject) -> bool:
-    return bool(shape.class_name() == "Instance")
-
-
 def _without_balls(mi: MitsubaModule, scene: MitsubaObject) -> tuple[MitsubaObject, list[tuple[Ball, MitsubaObject]]]:
     """A scene without its balls, if these are few beside other shapes, and the balls."""
     shapes = scene.shapes()
     balls = [shape for shape in shapes if shape.class_name() == "Sphere"]
-    # Mitsuba cannot put an instance into a second scene
-    if not 0 < len(balls) < len(shapes) or len(balls) > _MOST_BALLS or any(map(_is_instance, shapes)):
-        return scene, []
     others = {f"shape_{k}": shape for k, shape in enumerate(shapes) if shape.class_name() != "Sphere"}
+    # Mitsuba cannot put an instance into a second scene
+    has_instance = any(shape.class_name() == "Instance" for shape in shapes)
+    if not balls or len(balls) > _MOST_BALLS or not others or has_instance:
+        return scene, []
     return mi.load_dict({"type": "scene", **others}, optimize=False), [
         (_ball_around(shape.bbox(), 3**-0.5), shape) for shape in balls
     ]
