@@ -89,6 +89,42 @@ def test_neighbours_of_a_crop_are_those_of_the_full_sensor():
     assert some.mean(image[some.index])[where] == pytest.approx(plane[12:15, 19:22].mean(), rel=1e-6)
 
 
+def test_some_of_the_listed_pixels_have_the_neighbours_of_all():
+    """Among them corners and rims, where there are fewer than nine."""
+    rng, rows, cols = np.random.default_rng(12), 7, 9
+    listed = rng.permutation(rows * cols).astype(np.uint32)
+    values = rng.normal(3, 2, rows * cols).astype(np.float32)
+    some = rng.permutation(63)[:40]
+    # the sums over neighbours as they are first asked for, of some or of all
+    for is_first in (True, False):
+        sites = Sites.around(listed, Lattice.whole(rows, cols))
+        if not is_first:
+            sites.mean(values)
+        own = sites.only(some)
+        np.testing.assert_array_equal(own.index[own.listed], listed[some])
+        np.testing.assert_array_equal(own.mean(values), sites.mean(values)[some])
+        np.testing.assert_array_equal(own.most(values, 2), sites.most(values, 2)[some])
+
+
+def test_rays_of_rendered_pairs_do_not_depend_on_the_others():
+    """A plan has the rays, estimators, errors and floors that all pairs of each window would have."""
+    rng, shape, quality = np.random.default_rng(4), (6, 9 * 9), 0.4
+    sites = Sites.around(rng.permutation(81).astype(np.uint32), Lattice.whole(9, 9))
+    flux = np.repeat(rng.uniform(300, 500, (1, 81)), 6, axis=0).astype(np.float32)
+    flux[2:, 30:34] += 190
+    controlled, plain = rng.uniform(0, 40, (2, *shape)).astype(np.float32)
+    pilot = Pilot(flux, flux, controlled, plain, flux * rng.uniform(1, 3, shape).astype(np.float32))
+    gain = Gain(*TUNING.diffuse_gain)
+    what = plan(pilot, sites, lambda told: 7.0 + 0 * told, quality, gain, TUNING, is_knot=True)
+    assert 0 < what.rendered[1:-1].mean() < 0.5
+    units = np.full(shape, 7.0, np.float32)
+    for window, rendered in enumerate(what.rendered):
+        part = allocate(pilot, window, sites, units, quality, gain, TUNING, window in (0, 5))
+        for table, all_of_window in zip((what.rays, what.controlled, what.error, what.floor), part, strict=True):
+            np.testing.assert_array_equal(table[window, rendered], all_of_window[rendered])
+        assert len(set(part[3].tolist())) > 1
+
+
 def pilot_of(flux, scatter, unshadowed=None, refined=()):
     tables = [np.array(values, np.float32)[None] for values in (flux, scatter)]
     open_ = tables[0] if unshadowed is None else np.array(unshadowed, np.float32)[None]

@@ -19,9 +19,11 @@ from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.held_pairs import HeldPairs
 from hesim_render.sources.render.change_driven.neighbours import Lattice, Sites
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, PilotRays, not_negative
+from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.pilot import Anchored, Change, Pilot, Refinement, take_pilot
 from hesim_render.sources.render.change_driven.tuning import TUNING
 from hesim_render.sources.render.change_driven.windows import Windows
+from hesim_render.sources.render.exact import used_responses
 from hesim_render.sources.render.transport import outlines
 
 UNIT, QUALITY = 40.0, 0.6
@@ -51,6 +53,36 @@ def one_site(value, others=0.0):
     table = np.full(121, others, np.float32)
     table[CENTRE] = value
     return table
+
+
+def test_a_choice_does_not_depend_on_pairs_that_are_not_rendered():
+    """They would not be differences either if they took no rays by themselves."""
+    rng = np.random.default_rng(8)
+    tables = {name: rng.uniform(0, 60, (5, 121)) for name in ("controlled_scatter", "plain_scatter", "plain")}
+    pilot, units = pilot_of(5, open_flux=200.0, **tables), np.full((5, 121), UNIT, np.float32)
+    rendered = rng.random((5, 121)) < 0.4
+    alone = (2 ** rng.integers(5, 13, (5, 121))).astype(np.int16)
+    given = pilot, sites_of(), units, QUALITY
+    some = differences(*given, rendered, alone, TUNING)
+    every = differences(*given, np.ones_like(rendered), np.where(rendered, alone, 0).astype(np.int16), TUNING)
+    np.testing.assert_array_equal(some.rays, every.rays)
+    assert 0.05 < np.mean(some.rays[rendered] > 0) < 0.95
+    chosen = some.rays > 0
+    np.testing.assert_array_equal(some.error[chosen], every.error[chosen])
+    np.testing.assert_array_equal(some.controlled[chosen], every.controlled[chosen])
+
+
+def test_rays_of_a_pilot_are_kept_in_order_however_many_are_traced_at_a_time():
+    scene, sensor = hr.load_scene("rotating-star"), noisy(16, 12)
+    pixel, windows = np.arange(5, 137, dtype=np.uint32), Windows(np.array([100.0]), np.array([900.0]))
+    kept = []
+    for block_rays in (1 << 12, 1 << 10):
+        tracer = PairTracer(scene, sensor, 3, used_responses(sensor), block_rays=block_rays)
+        flux, rays = tracer.pilot_rays(pixel, np.zeros(pixel.size, np.int64), windows, 16, 1.25)
+        kept.append([np.array(rays.controlled), np.array(rays.plain)])
+        means = kept[-1][1].reshape(-1, 16).mean(axis=1) * tracer.axis_factor(pixel)
+        np.testing.assert_allclose(flux.plain, means, rtol=1e-5)
+    np.testing.assert_array_equal(*kept)
 
 
 def test_rays_follow_the_scatter_of_a_pixel_and_of_those_around():

@@ -1,13 +1,16 @@
 """Triangles in one plane that are found through a grid, against Mitsuba's own search."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
 from hesim_render.core.backend import select
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
-from hesim_render.sources.render.transport import sheets
+from hesim_render.sources.render.transport import moving_scene, sheets
 from hesim_render.sources.render.transport.closed_form import Part, surface_of
+from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.sheets import sheets_of
 
 COUNT = 60_000
@@ -133,7 +136,22 @@ def test_a_grid_only_serves_triangles_whose_boxes_overlap_much(monkeypatch):
         rim, triangles = fan(count)
         corners = np.append(np.concatenate([[[0, 0]], rim]), np.full((count + 1, 1), 0.2), axis=1)
         assert bool(sheets_of([mesh(corners, triangles)])) == is_served
+    # one plane of them is enough
+    assert len(sheets_of([mesh(corners, triangles), wall(np.eye(3), (0.1, 0.2, -0.1))])) == 2
     assert sheets_of(patches()) == []
+
+
+def test_moving_sheets_are_tested_one_by_one(monkeypatch):
+    """A loop over many objects knows faces and balls."""
+    forms = [SimpleNamespace(sheets=[1] if k in (1, 3, 6) else []) for k in range(7)]
+    groups = [SimpleNamespace(part=SimpleNamespace(form=form), trajectory=None) for form in (*forms, None)]
+    scene, made = MovingScene.__new__(MovingScene), []
+    scene.mi, scene.groups, scene._resting = None, groups, None
+    monkeypatch.setattr(moving_scene, "Tracks", lambda trajectories: None)
+    monkeypatch.setattr(moving_scene, "Fleet", lambda mi, own, numbers, *others: made.append((own, numbers)))
+    scene._sort_groups()
+    assert scene._single == [1, 3, 6, 7]
+    assert made == [([forms[k] for k in (0, 2, 4, 5)], [0, 2, 4, 5])]
 
 
 def test_there_is_no_gap_between_two_triangles_and_nothing_beyond_the_rim():

@@ -176,14 +176,13 @@ class Knots:
         low : last knot of each pixel up to it.
         """
         here, has_next = self.window[low], low + 1 < self.first[1:]
-        is_knot = here == window
-        high = low + (has_next & ~is_knot)
+        high = low + has_next
         # how far the window is on the way from one knot to the next, by the windows of both; 0 from a knot to itself
         centre = self.centre_us
         begin, span = centre[:, None], centre - centre[:, None]
         way = ((centre[window] - begin) / np.where(span > 0, span, np.inf)).astype(np.float32)
         part = way.ravel()[here.astype(np.int64) * centre.size + self.window[high]]
-        nothing = np.flatnonzero(~is_knot & ~has_next)
+        nothing = np.flatnonzero((here != window) & ~has_next)
         interpolated = []
         for values in self.values:
             start = values[low]

@@ -69,7 +69,7 @@ class SimpleForm:
         # known before any shape is looked at, which takes a kernel
         if len(balls) + sum(mesh.face_count() for mesh in meshes) / 2 > _MOST:
             # on a GPU, which has units of its own for triangles, times were not compared
-            if balls or len(meshes) < len(shapes) or select().backend == "cuda":
+            if len(meshes) < len(shapes) or select().backend == "cuda":
                 return None
             form.sheets.extend(sheets_of(meshes))
             return form if form.sheets else None
