@@ -14,6 +14,7 @@ from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.sheets import sheets_of
 
 COUNT = 60_000
+HALVES = [[0, 1, 2], [0, 2, 3]]
 
 pytestmark = pytest.mark.skipif(select().backend == "cuda", reason="a GPU has units for triangles")
 
@@ -258,3 +259,69 @@ def test_what_is_in_no_plane_is_left_to_mitsuba():
         part = Part(mi, scene_of(*shapes), apart=False)
         assert part.form is None
         assert not part._sheets
+
+
+def test_parts_of_triangles_within_a_square():
+    """Against many places: sides that stand upright or lie along the square, corners in and out of it."""
+    rng = np.random.default_rng(2)
+    triangles = rng.uniform(-1, 2, (70, 3, 2))
+    triangles[:20, 1, 0] = triangles[:20, 0, 0]
+    triangles[20:40, 2, 1] = triangles[20:40, 1, 1] = 0.3
+    triangles[40:50] = triangles[40:50] * 0.2 + 0.4
+    places = rng.random((20_000, 2))
+    before, after = triangles[:, [1, 2, 0]], triangles[:, [2, 0, 1]]
+    along, to = after - before, places[:, None, None] - before
+    sides = along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]
+    inside = np.all(sides > 0, axis=2) | np.all(sides < 0, axis=2)
+    np.testing.assert_allclose(sheets._parts(triangles), inside.mean(axis=0), atol=0.015)
+    whole = np.array(
+        [
+            [[-3, -3], [5, -3], [-3, 5]],
+            [[0, 0], [1, 0], [0, 1]],
+            [[0.25, 0], [0.75, 0], [0.25, 2]],
+            [[1, 0], [2, 1], [1, 1]],
+        ]
+    )
+    np.testing.assert_allclose(sheets._parts(whole), [1, 0.5, 0.375, 0], rtol=0, atol=1e-12)  # fmt: skip
+
+
+def test_cells_within_a_triangle_and_cells_that_triangles_cover():
+    """A fan of unequal triangles, of which one is left out."""
+    angle = np.sort(np.random.default_rng(7).uniform(0, 2 * np.pi, 23))
+    points = np.append([[0.1, -0.2]], 0.7 * np.stack([np.cos(angle), 1.3 * np.sin(angle)], axis=1), axis=0)
+    each = np.arange(1, 24)
+    triangles = np.stack([np.zeros(23, int), each, each % 23 + 1], axis=1)[np.arange(23) != 5]
+    (sheet,) = sheets_of([mesh(np.append(points, np.full((24, 1), 0.4), axis=1), triangles)])
+    side, (first, _) = 2**sheet.halvings, sheet.cells
+    begin, end = sheet.cell_rows.astype(int).T
+    covered, is_one = end % 2 == 1, begin == end // 2
+    # places in each cell, up to its rim, and the triangles that hold them
+    at = np.linspace(0.001, 0.999, 17)
+    row, col = np.divmod(np.arange(side**2), side)
+    places = np.stack(
+        np.broadcast_arrays((col[:, None, None] + at) / side, (row[:, None, None] + at[:, None]) / side), -1
+    )
+    inside = np.all(
+        np.einsum("nsk,cijk->cijns", sheet.distances[0][..., :2], places) + sheet.distances[0][..., 2] > 0, -1
+    )
+    in_all = inside.all(axis=(1, 2))
+    np.testing.assert_array_equal(is_one & covered, in_all.any(axis=1))
+    assert (sheet.cells[1][begin[is_one & covered]] == in_all.argmax(axis=1)[is_one & covered]).all()
+    np.testing.assert_array_equal(covered, inside.any(axis=3).all(axis=(1, 2)))
+    # all other cells keep their rows
+    others = ~(is_one & covered)
+    np.testing.assert_array_equal(begin[others], first[:-1][others])
+    np.testing.assert_array_equal(end[others] // 2, first[1:][others])
+    assert min(np.sum(is_one & covered), np.sum(covered & ~is_one), np.sum(~covered & (end // 2 > begin))) > 10
+
+
+def test_where_triangles_overlap_only_cells_within_one_count_as_covered():
+    """A square twice: the sum of its parts of a cell might hide a hole. Another square beside it does not overlap."""
+    square = np.array([[0, 0, 0], [2, 0, 0], [2, 3, 0], [0, 3, 0]])[HALVES] / 3
+    beside = square + np.array([2 / 3, 0, 0])
+    sheet = sheets.Sheet(np.concatenate([square, square, beside]), np.zeros((6, 2), np.uint32))
+    side = 2**sheet.halvings
+    # the first side of the square, along which cells lie, takes half of them, so that its diagonal rises by two of them
+    expected = np.ones((side, side), int)
+    expected[np.arange(side), np.arange(side) // 2] = 0
+    np.testing.assert_array_equal(sheet.cell_rows[:, 1].reshape(side, side) % 2, expected)

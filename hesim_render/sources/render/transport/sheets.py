@@ -35,6 +35,8 @@ _CELLS, _MOST_HALVINGS = 16, 8
 _INSIDE = np.array([[1, 1, 1], [6, 1, 1], [1, 6, 1], [1, 1, 6], [5, 5, 1], [5, 1, 5], [1, 5, 5]], np.float64)
 _INSIDE /= _INSIDE.sum(axis=1, keepdims=True)
 _CLEAR = 10.0
+#: Part of a cell that may be open where triangles cover it.
+_WHOLE = 1e-6
 #: Numbers of a row: those that map a place on the sheet to its distances from the three sides of a triangle, m; the
 #: triangle; and the inverse distances of its second and third corner from the sides opposite to them.
 _ROW = 12
@@ -72,6 +74,22 @@ class Sheet:
     def cells(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """See `_cells`."""
         return _cells(self.frame[1], self.halvings)
+
+    @property
+    def cell_rows(self) -> NDArray[np.uint32]:
+        """First and end of the rows of each cell, [cells, 2]; the end counts twice, plus 1 if triangles cover the cell.
+        Of a cell within one triangle, both are the row of that one.
+        """
+        (first, triangle), side = self.cells, 2**self.halvings
+        of_cell = np.repeat(np.arange(first.size - 1), np.diff(first))
+        row, col = np.divmod(of_cell, side)
+        parts = _parts(self.frame[1][triangle] * side - np.stack([col, row], axis=1)[:, None])
+        rows = np.stack([first[:-1], 2 * first[1:]], axis=1)
+        # a sum above 1 would be of triangles that overlap, which may hide a hole
+        rows[:, 1] += abs(np.bincount(of_cell, parts, first.size - 1) - 1) <= _WHOLE
+        alone = np.flatnonzero(parts >= 1 - _WHOLE)
+        rows[of_cell[alone]] = np.stack([alone, 2 * alone + 1], axis=1)
+        return rows.astype(np.uint32)
 
     @cached_property
     def distances(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -140,13 +158,13 @@ class DeviceSheet:
     def __init__(self, mi: MitsubaModule, sheet: Sheet, shapes: Sequence[MitsubaObject]) -> None:
         self._mi = mi
         self._rows = [(mi.Vector3f(row[:3]), mi.Float(float(row[3]))) for row in sheet.frame[0]]
-        (first, triangle), (maps, per_m) = sheet.cells, sheet.distances
+        (_, triangle), (maps, per_m) = sheet.cells, sheet.distances
         rows = np.zeros((triangle.size + 1, _ROW), np.float32)
         rows[:-1, :9], rows[:-1, 10:] = maps[triangle].reshape(-1, 9), per_m[triangle, 1:]
         rows[:-1, 9] = triangle.astype(np.uint32).view(np.float32)
         pointers: list[UInt32] = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)) for shape in shapes]
         numbers = [int(pointer[0]) for pointer in pointers]
-        self._first, self._triangles = table(mi.UInt32, first.astype(np.uint32)), table(mi.Float, rows)
+        self._cells, self._triangles = table(mi.UInt32, sheet.cell_rows), table(mi.Float, rows)
         self._shape = table(mi.UInt32, np.array(numbers, np.uint32)[sheet.owner[:, 0]])
         self._prim = table(mi.UInt32, sheet.owner[:, 1])
         self._side, self._seam = mi.UInt32(2**sheet.halvings), mi.Float(sheet.seam_m)
@@ -163,7 +181,7 @@ class DeviceSheet:
         triangle : its number.
         """
         mi = self._mi
-        t, place, last, cell = self._start(ray, active)
+        t, place, cell, last, covered = self._start(ray, active)
 
         def step(row: UInt32, most: Float, own: UInt32) -> tuple[UInt32, Float, UInt32]:
             margin, *_ = self._inside(row, place)
@@ -172,7 +190,8 @@ class DeviceSheet:
 
         # at a seam, the triangle that holds the point, or comes nearest to it
         _, margin, row = dr.while_loop(
-            (cell, -self._seam, mi.UInt32(0)),
+            # a cell within one triangle has no rows to choose from
+            (cell, dr.select(covered & (cell == last), mi.Float(dr.inf), -self._seam), mi.UInt32(cell)),
             lambda row, *_: row < last,
             step,
             labels=("row", "margin", "own"),
@@ -190,13 +209,13 @@ class DeviceSheet:
 
     def blocks(self, ray: Ray, active: Mask) -> Mask:
         """True where a triangle is met before `maxt`."""
-        _, place, last, cell = self._start(ray, active)
+        _, place, cell, last, covered = self._start(ray, active)
 
         def step(row: UInt32, is_met: Mask) -> tuple[UInt32, Mask]:
             return row + 1, is_met | (self._inside(row, place)[0] > -self._seam)
 
         _, is_met = dr.while_loop(
-            (cell, self._mi.Bool(False)),
+            (cell, covered),
             lambda row, is_met: (row < last) & ~is_met,
             step,
             labels=("row", "is_met"),
@@ -205,19 +224,14 @@ class DeviceSheet:
         blocked: Mask = is_met
         return blocked
 
-    def _start(self, ray: Ray, active: Mask) -> tuple[Float, Point2, UInt32, UInt32]:
-        """Distance to the plane, the place there, and the end and begin of the rows of its cell."""
+    def _start(self, ray: Ray, active: Mask) -> tuple[Float, Point2, UInt32, UInt32, Mask]:
+        """Distance to the plane, the place there, begin and end of the rows of its cell, and whether it is covered."""
         mi = self._mi
         t, place, inside = to_face(ray, self._rows)
         active = active & inside & (t >= 0) & (t < ray.maxt)
         col, row = (dr.minimum(mi.UInt32(at * mi.Float(self._side)), self._side - 1) for at in place)
-        cell = row * self._side + col
-        return (
-            t,
-            place,
-            dr.gather(mi.UInt32, self._first, cell + 1, active),
-            dr.gather(mi.UInt32, self._first, cell, active),
-        )
+        begin, end = dr.gather(mi.Array2u, self._cells, row * self._side + col, active)
+        return t, place, begin, end >> 1, (end & 1) != 0
 
     def _inside(self, row: UInt32, place: Point2, active: Mask | bool = True) -> tuple[Float, Float, Float, Bands]:
         """Least distance of a place from the sides of the triangle of a row, m, positive inside; those from the sides
@@ -289,3 +303,21 @@ def _cells(uv: NDArray[np.float64], halvings: int) -> tuple[NDArray[np.int64], N
     order = np.argsort(number, kind="stable")
     ends = np.cumsum(np.bincount(number, minlength=4**halvings))
     return np.append(0, ends), triangle[order]
+
+
+def _parts(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Areas of triangles [n, 3, 2] within the square from 0 to 1."""
+    (x, y), (along_x, along_y) = (
+        np.moveaxis(each, 2, 0) for each in (triangles, np.roll(triangles, -1, 1) - triangles)
+    )
+    # the part of each side that lies over the square
+    begin, end = np.clip(x, 0, 1), np.clip(x + along_x, 0, 1)
+    slope = np.divide(along_y, along_x, out=np.zeros_like(x), where=along_x != 0)
+    low, high = y + slope * (begin - x), y + slope * (end - x)
+    # mean height of the side there, no less than 0 and no more than 1, by the integral of heights cut like this
+    cut_low, cut_high = np.clip(low, 0, 1), np.clip(high, 0, 1)
+    areas = [0.5 * np.square(cut) + np.maximum(height - 1, 0) for cut, height in ((cut_low, low), (cut_high, high))]
+    is_steep = abs(high - low) > 1e-9
+    mean = np.divide(areas[1] - areas[0], high - low, out=0.5 * (cut_low + cut_high), where=is_steep)
+    # below two sides of a triangle is what is below the third one, and the triangle
+    return np.asarray(abs(((end - begin) * mean).sum(axis=1)))
