@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from hesim_render.core.backend import jit
+from hesim_render.sources.render.scene.tracks import Tracks
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.truth.imu import _velocity
 from hesim_render.specs.motion import TrackSpec
@@ -135,3 +136,26 @@ def test_the_velocity_of_a_point_is_the_slope_of_its_path(repeat):
     np.testing.assert_allclose(edges[:2], _velocity(moves, place, np.array([4000.5, 7000.5])), rtol=2e-3, atol=1e-2)
     assert edges[2].any() == repeat
     assert _velocity(None, place, times).shape == (9, 3) and not _velocity(None, place, times).any()
+
+
+def test_many_tracks_of_uneven_keyframes_find_their_segments():
+    """From 2 to 900 keyframes, 2 µs to 30 ms apart, so that some are close together; at all keyframes and between."""
+    rng, tracks = np.random.default_rng(12), []
+    for count in (2, 3, 40, 900):
+        gaps = np.rint(10 ** rng.uniform(0.3, 4.5, count - 1)).astype(int)
+        times = np.append(0, np.cumsum(gaps))
+        keys = [
+            {"t_us": int(t), "translation_m": [round(float(x), 3), 0.1, 0]}
+            for t, x in zip(times, rng.uniform(-1, 1, count), strict=True)
+        ]
+        tracks.append(Trajectory(TrackSpec.model_validate({"object": "camera", "keyframes": keys})))
+    together, types = Tracks(tracks), jit()
+    for number, own in enumerate(tracks):
+        knots = own.knots_us
+        middles = 0.5 * (knots[1:] + knots[:-1])
+        local = np.concatenate([knots, middles, rng.uniform(0, knots[-1], 3000)]).astype(np.float32)
+        wanted = own.matrix(local.astype(np.float64))[:, :3, 3]
+        # as a number of all lanes, and as one of each lane
+        for which in (number, types.UInt32(np.full(local.size, number, np.uint32))):
+            found = np.array(together.pose(which, types.Float(local)).shift).T
+            np.testing.assert_allclose(found, wanted, atol=2e-4)

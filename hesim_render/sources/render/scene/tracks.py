@@ -96,9 +96,21 @@ class Tracks:
         self._heads, self._rows, self._times = (
             table(types.Float, np.concatenate(values).astype(np.float32)) for values in (heads, rows, times)
         )
-        #: Steps of the search for a segment; rounded so that tracks of similar length share a kernel.
-        self._most = 1 << max(0, max(map(len, rows)) - 1).bit_length()
-        dr.make_opaque(self._heads, self._rows, self._times)
+        #: Cells of equal length of each track, two for each segment, of which a table has the first segment.
+        self._cells = 2 << max(0, max(map(len, rows)) - 1).bit_length()
+        # what rounding may move a time by, in cells
+        margin = max(0.01, 2.0**-22 * self._cells)
+        first, last = (np.stack([self._segments(knots, shift) for knots in times]) for shift in (-margin, 1 + margin))
+        self._first = types.UInt32(first.astype(np.uint32).ravel())
+        #: Largest number of segments that begin in a cell; rounded so that similar tracks share a kernel.
+        self._most = (1 << int((last - first).max()).bit_length()) - 1
+        dr.make_opaque(self._heads, self._rows, self._times, self._first)
+
+    def _segments(self, knots: NDArray[np.float64], shift: float) -> NDArray[np.int64]:
+        """Segment of each cell of a track at a place in it, in cells from its begin."""
+        at = (np.arange(self._cells) + shift) / self._cells * knots[-1]
+        segment = np.searchsorted(np.float32(knots), np.float32(at), side="right") - 1
+        return np.asarray(np.clip(segment, 0, knots.size - 2))
 
     def pose(self, number: UInt32, local_us: Float) -> DevicePose:
         """Pose of every lane at its own time.
@@ -115,18 +127,20 @@ class Tracks:
         wrapped = local_us - period * dr.floor(local_us / period)
         local_us = dr.select((repeat > 0) & (local_us >= period), wrapped, local_us)
         local_us = dr.clip(local_us, 0, period)
-        last = types.UInt32(knots) - 2  # last segment
-        base = types.UInt32(first_time)
-        segment = dr.binary_search(
-            0,
-            self._most - 1,
-            lambda i: (
-                (types.UInt32(i) < last)
-                & (dr.gather(types.Float, self._times, base + dr.minimum(types.UInt32(i) + 1, last)) <= local_us)
-            ),
-        )
-        place = 4 * (types.UInt32(first_row) + dr.minimum(types.UInt32(segment), last))
-        row = [x for k in range(4) for x in dr.gather(types.Array4f, self._rows, place + k)]
+        place = types.UInt32(first_row)
+        # a track of one segment has nothing to search for
+        if self._most:
+            last, base = types.UInt32(knots) - 2, types.UInt32(first_time)
+            cell = dr.minimum(types.UInt32(local_us * (self._cells / period)), self._cells - 1)
+            first = dr.gather(types.UInt32, self._first, number * self._cells + cell)
+
+            def is_later(further: UInt32) -> Mask:
+                """Whether the time is beyond the segment so many after the first one of its cell."""
+                end = base + dr.minimum(first + types.UInt32(further) + 1, last)
+                return dr.gather(types.Float, self._times, end) <= local_us
+
+            place += dr.minimum(first + types.UInt32(dr.binary_search(0, self._most, is_later)), last)
+        row = [x for k in range(4) for x in dr.gather(types.Array4f, self._rows, 4 * place + k)]
         share = (local_us - row[0]) * row[1]
         sine, cosine = dr.sincos(share * row[2])
         vector = types.Array3f

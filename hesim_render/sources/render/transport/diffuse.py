@@ -161,6 +161,9 @@ class DiffuseIntegrator:
         met : Bool, True where the path came through the box of a moving object.
         """
         mi, scene = self._scene.mi, self._scene
+        if self._outlines is not None and self._outlines.groups:
+            # outlines need these poses in all lanes, so surfaces and shadows may share them
+            moment = scene.posed(moment, self._outlines.groups)
         surface = scene.intersect(ray, moment, True, mi.Bool(True), mi.RayFlags.UV | mi.RayFlags.ShadingFrame)
         si, met = surface.rest, surface.met
         hit = si.is_valid()

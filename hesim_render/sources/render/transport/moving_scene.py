@@ -11,8 +11,8 @@ Objects are tested only against rays that meet the box which contains the object
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -263,9 +263,14 @@ class MovingScene:
         rows = box_rows(np.stack([stays_in(one.corners, one.trajectory, spans_us) for one in self.groups], axis=1))
         return rows if self._fleet is None else np.concatenate([rows, self._fleet.rows(rows)], axis=1)
 
-    def pose(self, group: UInt32, moment: Moment) -> DevicePose:
+    def pose(self, group: UInt32 | int, moment: Moment) -> DevicePose:
         """Pose of the group whose number each lane holds."""
-        return self._tracks.pose(group, moment.local_us(group))
+        known = moment.poses.get(group) if isinstance(group, int) else None
+        return known or self._tracks.pose(group, moment.local_us(group))
+
+    def posed(self, moment: Moment, groups: Iterable[int]) -> Moment:
+        """The same times with the poses of some groups, which all lanes share: each is then computed once a ray."""
+        return replace(moment, poses={group: self.pose(group, moment) for group in groups})
 
     def resting_distance(self, ray: Ray) -> Float:
         """Distance to the nearest resting surface, m; infinite where there is none."""
@@ -308,7 +313,7 @@ class MovingScene:
             met |= near
 
             def turn_to(*state: Any, number: int = number, near: Mask = near) -> LoopState:
-                pose = self._tracks.pose(number, moment.local_us(number))
+                pose = self.pose(number, moment)
                 return visit(self.groups[number], pose, _at_rest(ray, pose), near, state)
 
             state = dr.if_stmt(state, near, turn_to, lambda *state: state, label="moving group")

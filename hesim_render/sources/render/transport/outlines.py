@@ -226,6 +226,7 @@ class OccludedSky:
     Attributes
     ----------
     is_known : True if there are any outlines.
+    groups : numbers of the moving groups that have some.
     """
 
     def __init__(self, scene: MovingScene) -> None:
@@ -236,6 +237,7 @@ class OccludedSky:
             (None if number == 0 else number - 1, Screen(scene.mi, part)) for number, part in enumerate(parts) if part
         ]
         self.is_known = bool(self._screens)
+        self.groups = [number for number, _ in self._screens if number is not None]
 
     def hides(self, point: Point3, normal: Vector3, direction: Vector3, moment: Moment) -> tuple[Float, Float]:
         """As `Screen.hides`, of all outlines; in world space, at the time of each ray."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, Ray, UInt32, Vector3
+from hesim_render.sources.render.scene.tracks import DevicePose
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,7 @@ class Moment:
     boxes : Float table, rows of `box_rows`: those of all groups, and what `Fleet.rows` adds.
     rows : number of rows in a bin.
     bin : UInt32, number of the set of boxes that holds for the ray's window.
+    poses : poses that are known for all lanes, by the number of their track.
     """
 
     instant_us: Float
@@ -33,6 +36,7 @@ class Moment:
     boxes: Float
     rows: int
     bin: UInt32
+    poses: Mapping[int, DevicePose] = field(default_factory=dict)
 
     def local_us(self, track: UInt32) -> Float:
         """Time since the first keyframe of a track, µs, as `Tracks.pose` takes it."""
