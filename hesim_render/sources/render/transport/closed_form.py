@@ -30,6 +30,7 @@ from hesim_render.core.device_types import (
     UInt32,
     Vector3,
 )
+from hesim_render.sources.render.transport.blockers import Blockers, box_of
 from hesim_render.sources.render.transport.faces import SAME, Face, faces_of
 from hesim_render.sources.render.transport.intersections import meets_ball, to_ball, to_face
 from hesim_render.sources.render.transport.sheets import DeviceSheet, Sheet, sheets_of
@@ -117,14 +118,22 @@ class Part:
             for ball, shape in self.form.balls:
                 self._balls.append((mi.Point3f(ball.middle), mi.Float(ball.square), mi.ShapePtr(shape)))
             self._sheets = [DeviceSheet(mi, sheet, self.form.meshes) for sheet in self.form.sheets]
+            boxes = {mesh.id(): box for mesh in self.form.meshes if (box := box_of(mesh)) is not None}
+            faces = [face.to_uvh for face, shape in self.form.faces if shape.id() not in boxes]
+            self._blockers = Blockers(mi, self._middles, list(boxes.values()), faces, self._sheets)
         else:
             self._scene, balls = _without_balls(mi, scene)
             self._balls = [(mi.Point3f(b.middle), mi.Float(b.square), mi.ShapePtr(shape)) for b, shape in balls]
             # somewhat widened: rounding must not take a rim
             ball = _ball_around(scene.bbox(), 1.0001)
             self._around = (mi.Point3f(ball.middle), mi.Float(ball.square)) if apart else None
+            self._blockers = Blockers.of(mi, self._scene, self._middles)
         # shapes as well: their numbers within the kernel would make it another one for every scene
         dr.make_opaque(self._balls, [(rows, shape) for rows, _, shape in self._faces], self._surfaces, self._around)
+
+    @property
+    def _middles(self) -> list[tuple[Point3, Float]]:
+        return [(middle, square) for middle, square, _ in self._balls]
 
     @property
     def face_count(self) -> int:
@@ -179,18 +188,7 @@ class Part:
 
     def blocks(self, ray: Ray, active: Mask) -> Mask:
         """True where a ray hits anything before its `maxt`."""
-        blocked = self._mi.Bool(False)
-        for middle, square, _ in self._balls:
-            t = to_ball(ray, middle, square)
-            blocked |= (t >= 0) & (t < ray.maxt)
-        if self._scene is not None:
-            return (blocked & active) | self._scene.ray_test(ray, active & ~blocked & self._near(ray))
-        for rows, _, _ in self._faces:
-            t, _, inside = to_face(ray, rows)
-            blocked |= inside & (t >= 0) & (t < ray.maxt)
-        for sheet in self._sheets:
-            blocked |= sheet.blocks(ray, active & ~blocked)
-        return blocked & active
+        return self._blockers.block(ray, active, self._near(ray))
 
     def describe_faces(self, si: Interaction, hit: Interaction, face: UInt32) -> None:
         """Fill in normals, axes, texture coordinates and triangles of lanes that hit a face of this part."""

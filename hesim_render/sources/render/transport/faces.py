@@ -54,11 +54,7 @@ def faces_of(mi: MitsubaModule, shape: MitsubaObject) -> list[Face]:
         if order is None or not flat:
             return []
         (own, on_u, on_v), (opposite, at_u, at_v) = order
-        corner = vertices[first[own]]
-        sides = vertices[first[on_u]] - corner, vertices[first[on_v]] - corner
-        normal = np.cross(*sides)
-        inverse = np.linalg.inv(np.stack([*sides, normal / np.linalg.norm(normal)], axis=1))
-        to_uvh = np.concatenate([inverse, -(inverse @ corner)[:, None]], axis=1)
+        to_uvh = _map(vertices[first[list(order[0])]])
         one, other = corners.pop("uv")
         uv = [
             [one[own], one[on_u] - one[own], one[on_v] - one[own]],
@@ -67,6 +63,20 @@ def faces_of(mi: MitsubaModule, shape: MitsubaObject) -> list[Face]:
         surface = {name: values[:, 0] for name, values in corners.items()}
         faces.append(Face(2 * number, order, to_uvh, {**surface, "uv": np.array(uv)}))
     return faces
+
+
+def map_of(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """`Face.to_uvh` of two triangles, [3, 3] each, m; None if they do not form a parallelogram."""
+    order = _parallelogram(one, other)
+    return None if order is None else _map(one[list(order[0])])
+
+
+def _map(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`Face.to_uvh` from the corners at (0, 0), (1, 0) and (0, 1), [3, 3], m."""
+    sides = corners[1:] - corners[0]
+    normal = np.cross(*sides)
+    inverse = np.linalg.inv(np.stack([*sides, normal / np.linalg.norm(normal)], axis=1))
+    return np.concatenate([inverse, -(inverse @ corners[0])[:, None]], axis=1)
 
 
 def _parallelogram(
