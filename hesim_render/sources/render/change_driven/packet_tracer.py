@@ -13,7 +13,7 @@ from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Ray, UInt32, UInt64
 from hesim_render.core.method_cache import method_cache
 from hesim_render.core.rng import Stream, stream_key
-from hesim_render.core.tables import spread_out
+from hesim_render.core.tables import spread_out, table
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.change_driven.aim import Aim, LaneAims, PairAims
@@ -197,28 +197,32 @@ class PacketTracer(Tracer):
         used = int(packets.sum())
         ray_index = dr.arange(types.UInt32, used * PACKET)
         pair = pair_of_rays(packets)
-        # the first ray of the pair, and what the pair has
-        first = (np.cumsum(packets) - packets) * PACKET
-        tables = first.astype(np.uint32), *lanes, half_rays.astype(np.uint32)
-        start, pixel, window, repeat, per_half = (spread_out(types.UInt32, values, pair) for values in tables)
+        # the first ray of each pair, and what the pair has, side by side, so that one fetch brings them
+        pixel_of, window_of, repeat_of = lanes
+        columns = (np.cumsum(packets) - packets) * PACKET, pixel_of, window_of, half_rays
+        heads = table(types.UInt32, np.stack(columns, axis=1).astype(np.uint32))
+        start, pixel, window, per_half = dr.gather(types.Array4u, heads, pair)
         sample = ray_index - start
         half = dr.select(sample >= per_half, types.UInt32(1), types.UInt32(0))
-        within_half, aimed = sample - half * per_half, None
+        within_half, aimed, kinds = sample - half * per_half, None, 2
         if aims is not None:
             # rays of either kind have random numbers of their own, and are stratified among themselves
-            per_half //= 2
+            per_half, kinds = per_half // 2, 4
             is_aimed = within_half >= per_half
             kind: type[LaneAims | LaneEdges] = LaneAims if isinstance(aims, PairAims) else LaneEdges
             aimed = kind.of(aims, pair, is_aimed)  # type: ignore[arg-type]
             within_half = dr.select(is_aimed, within_half - per_half, within_half)
             half += dr.select(is_aimed, types.UInt32(2), 0)
-        self._sampler.setup(key, pixel, half, within_half, per_half, MOST_SAMPLES // 2, repeat)
+        keys = self._keys_of(key, heads, repeat_of, kinds)
+        own_keys = dr.gather(types.Array4u, keys, dr.opaque(types.UInt32, kinds) * pair + half)
+        self._sampler.start(tuple(own_keys), within_half, per_half, MOST_SAMPLES // 2)
         rays = self._rays_of(pixel, window, moments, footprint, aimed)
-        # A kernel of its own makes the rays, so that one kernel traces them however they were aimed. Rays that pass
-        # through memory cost no time that could be measured.
-        self._sampler.evaluate()
+        # A kernel of its own makes the rays, so that one kernel traces them however they were aimed. It brings the
+        # numbers from which the next draws are made as well. Places and shares of the window are evaluated where they
+        # are used, from the same numbers.
         now = rays.now
         dr.eval(
+            self._sampler.state,
             rays.ray.o,
             rays.ray.d,
             now.instant_us,
@@ -227,8 +231,6 @@ class PacketTracer(Tracer):
             rays.filter,
             rays.weight,
             rays.model,
-            rays.place,
-            rays.share,
         )
         *fluxes, met = self._integrator.flux(self._sampler, rays.ray, now, rays.filter)
         bits = dr.select(met, types.UInt32(1), dr.zeros(types.UInt32, used * PACKET))
@@ -239,6 +241,24 @@ class PacketTracer(Tracer):
             fluxes = [(flux - model) * rays.weight for flux in fluxes]
             dr.eval(fluxes)
         return _Traced((fluxes[0], fluxes[1], fluxes[2], bits), rays.place, rays.share)
+
+    def _keys_of(self, key: UInt64, heads: UInt32, repeat: NDArray[np.uint32], kinds: int) -> UInt32:
+        """Keys of the random numbers of each pair and kind of ray, four numbers each: once for all rays of a kind.
+
+        Parameters
+        ----------
+        heads : four numbers of each pair, of which the second one is its pixel.
+        repeat : repetition of each pair.
+        kinds : number of kinds of a pair.
+        """
+        types = jit()
+        each = dr.arange(types.UInt32, repeat.size * kinds)
+        pair = each // dr.opaque(types.UInt32, kinds)
+        pixel = dr.gather(types.UInt32, heads, 4 * pair + 1)
+        of_pair = pixel, each - pair * dr.opaque(types.UInt32, kinds), spread_out(types.UInt32, repeat, pair)
+        keys: UInt32 = dr.ravel(types.Array4u(self._sampler.keys_of(key, *of_pair)))
+        dr.eval(keys)
+        return keys
 
     def _rays_of(
         self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float, aims: LaneAims | LaneEdges | None

@@ -143,14 +143,28 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
             most : largest n of all lanes.
             repeat : number of the repetition, UInt32 per lane; each has random numbers of its own.
             """
-            self.keys = mi.Philox4x32(key, pixel, half, mi.UInt32(repeat)).next_uint32x4()
-            self.sample, self.dimension = sample, dr.zeros(mi.UInt32, dr.width(pixel))
+            self.start(self.keys_of(key, pixel, half, repeat), sample, samples_per_half, most)
+
+        @staticmethod
+        def keys_of(key: UInt64, pixel: UInt32, half: UInt32, repeat: UInt32 | int = 0) -> tuple[UInt32, ...]:
+            """The four keys of a half of a pixel; see `setup`."""
+            return tuple(mi.Philox4x32(key, pixel, half, mi.UInt32(repeat)).next_uint32x4())
+
+        def start(
+            self, keys: tuple[UInt32, ...], sample: UInt32, samples_per_half: UInt32 | int, most: int = 0
+        ) -> None:
+            """Start one wavefront whose keys are known; see `setup`."""
+            self.keys = keys
+            self.sample, self.dimension = sample, dr.zeros(mi.UInt32, dr.width(sample))
             self._bits = max(0, ((most or samples_per_half) - 1).bit_length())
             self._mask = samples_per_half - 1 if most else (1 << self._bits) - 1
 
-        def evaluate(self) -> None:
-            """Evaluate the state between two draws, so that the next draws belong to another kernel."""
-            dr.eval(self.keys, self.sample, self._mask)
+        @property
+        def state(self) -> tuple[object, ...]:
+            """What the next draws are made from. Where it is evaluated between two draws, the next ones belong to
+            another kernel.
+            """
+            return self.keys, self.sample, self._mask
 
         def _draw(self) -> tuple[UInt32, list[UInt32]]:
             """Index of the next point, and the random bits that shift its coordinates."""
