@@ -35,10 +35,11 @@ class Detected:
 
     def __init__(self, light, scatter=(40.0, 70.0), near=True, spread=None):
         self.light, self.scatter, self.near, self.traced, self.spread = light, scatter, near, [], spread
-        self.rays, self.parts = SimpleNamespace(spreads=False), SimpleNamespace(groups=[])
+        self.rays, self.parts, self.mild = SimpleNamespace(spreads=False), SimpleNamespace(groups=[]), set()
 
     def pilot(self, index, window, windows, rays, width_px, stream=Stream.RENDER_PILOT, span_us=None, before=None,
-              repeat=0):  # fmt: skip
+              mild=False, repeat=0):  # fmt: skip
+        self.mild.add(mild)
         pairs = zip(window.tolist(), index.tolist(), strict=True)
         self.traced += [(int(stream), rays, width_px, repeat, *pair) for pair in pairs]
         found = PilotFlux.empty(index.size)
@@ -71,7 +72,7 @@ def wanted_error(flux):
     return np.where(flux > 796, WANTED * flux / 800, np.where(flux > 600, 20, 15)).astype(np.float32)
 
 
-def found_by(light, sites=None, first=(59.0, 70.0), near=True, spread=None):
+def found_by(light, sites=None, first=(59.0, 70.0), near=True, spread=None, mild=False):
     sites = Sites.alone(np.arange(light.shape[1], dtype=np.uint32)) if sites is None else sites
     tracer, seen = Detected(light, spread=spread), PilotFlux.empty(sites.size)
     seen.controlled[:], seen.plain[:] = 800, 805
@@ -79,7 +80,7 @@ def found_by(light, sites=None, first=(59.0, 70.0), near=True, spread=None):
     numbers = np.repeat(np.arange(COUNT)[:, None], sites.size, axis=1)
     windows = Windows(np.arange(COUNT) * 4.0, np.arange(COUNT) * 4.0 + 3)
     near = np.ones(sites.size, bool) & near
-    marked = windows_with_changes(tracer, sites, numbers, windows, seen, near, wanted_error, 1.6)
+    marked = windows_with_changes(tracer, sites, numbers, windows, seen, near, wanted_error, 1.6, mild)
     return tracer, sorted(zip(*(each.tolist() for each in np.nonzero(marked)), strict=True))
 
 
@@ -132,7 +133,16 @@ def test_pixels_whose_rays_differ_are_looked_at_in_all_windows():
     inner = range(1, COUNT - 1)
     assert windows_of(found, 3) == windows_of(found, 5) == list(inner)
     assert windows_of(found, 1) == [1, 2, 3, 4, 5] and not windows_of(found, 6) and not windows_of(found, 2)
-    assert not {3, 5, 6} & {index for *_, index in tracer.traced}
+    assert not {3, 5, 6} & {index for *_, index in tracer.traced} and tracer.mild == {False}
+    # a mild scatter is that of one ray in 32, whose fourth root is 0.42
+    scatter[0][[1, 4]], scatter[1][[1, 4]] = (25.0, 25.5), 70
+    scatter[0][[0, 2, 3, 5, 6]] = 20
+    tracer, found = found_by(light_of(), first=scatter, mild=True, spread=np.full((COUNT, SITES), 20.0, np.float32))
+    assert {site for _, site in found} == {4} and tracer.mild == {True}
+    spread = np.full((COUNT, SITES), 20.0, np.float32)
+    spread[3:5, 2], spread[3:5, 5] = 25.0, 25.5
+    _, found = found_by(light_of(), first=(20.0, 70.0), mild=True, spread=spread)
+    assert {site for _, site in found} == {5}
 
 
 def test_windows_in_which_few_rays_differ_are_looked_at():
@@ -194,7 +204,7 @@ def test_what_a_site_misses_its_neighbours_see():
     assert 4 in windows_of(found, 7)
 
 
-def pilot_by(tracer, rays, anchored=None, known=None, span_us=None, stride=1):
+def pilot_by(tracer, rays, anchored=None, known=None, span_us=None, stride=1, mild=False):
     sites = Sites.alone(np.arange(SITES, dtype=np.uint32))
     numbers = np.repeat(np.arange(COUNT)[:, None], SITES, axis=1)
     windows = Windows(np.arange(COUNT) * 4.0, np.arange(COUNT) * 4.0 + 3)
@@ -203,7 +213,7 @@ def pilot_by(tracer, rays, anchored=None, known=None, span_us=None, stride=1):
     def wanted(flux):
         return np.full(flux.shape, WANTED, np.float32)
 
-    return take_pilot(tracer, *given, anchored=anchored, known=known, stride=stride, wanted=wanted)[0]
+    return take_pilot(tracer, *given, anchored=anchored, known=known, stride=stride, wanted=wanted, mild=mild)[0]
 
 
 def test_a_pilot_of_many_rays_looks_where_few_see_a_change_and_at_the_end():
@@ -238,7 +248,10 @@ def test_windows_between_looks_show_what_the_one_before_does():
         return found
 
     tracer.pilot = pilot
-    tracer.pilot_rays = lambda *given, span_us=None, before=None: (pilot(*given), PilotRays(zeros, zeros, 32, (0.0, 3)))
+    tracer.pilot_rays = lambda *given, span_us=None, before=None, mild=False: (
+        pilot(*given),
+        PilotRays(zeros, zeros, 32, (0.0, 3)),
+    )
     known = PilotRays(zeros, zeros, 32, (-4.0, -1.0))
     anchored = Anchored(pilot(np.arange(SITES), np.zeros(SITES, int), None, 32, 1.6), known, (-4.0, -1.0))
     taken = pilot_by(tracer, 32, anchored=anchored)
@@ -259,12 +272,48 @@ def test_a_block_that_begins_with_its_anchor_takes_its_pilot():
         ((0.0, 3.0), (0.0, 38.0), False), ((0.0, 3.0), (1.0, 39.0), False), ((0.0, 3.0), None, False),
     ):  # fmt: skip
         tracer = Detected(light_of())
-        tracer.pilot_rays = lambda *given, span_us=None, before=None, tracer=tracer: (tracer.pilot(*given), rays)
+        tracer.pilot_rays = lambda *given, span_us=None, before=None, mild=False, tracer=tracer: (
+            tracer.pilot(*given),
+            rays,
+        )
         anchored = Anchored(first, rays, window_us, near_us)
         pilot = pilot_by(tracer, 16, anchored=anchored, span_us=(0.0, 39.0))
         assert pilot.controlled[0, 2] == (640 if is_known else 800), (window_us, near_us)
         assert any(count == 16 and window == 0 for _, count, _, _, window, _ in tracer.traced) != is_known
         assert np.all(pilot.change.controlled[0] == pilot.controlled[0] - 640)
+
+
+@pytest.mark.parametrize("mild", [False, True])
+def test_all_looks_take_the_same_scatter(mild):
+    for rays, stride in ((32, 1), (8, 1), (8, 4)):
+        tracer = Detected(light_of(s3=(5, 44.0)))
+        pilot_by(tracer, rays, stride=stride, mild=mild)
+        assert tracer.mild == {mild}
+    # with the pilot of an anchor
+    zeros = jit().Float(np.zeros(SITES * 32, np.float32))
+    rays, told = PilotRays(zeros, zeros, 32, (0.0, 3.0)), set()
+    tracer = Detected(light_of(s3=(5, 44.0)))
+
+    def pilot_rays(*given, span_us=None, before=None, mild=False):
+        told.add(mild)
+        return tracer.pilot(*given, mild=mild), rays
+
+    tracer.pilot_rays = pilot_rays
+    anchored = Anchored(PilotFlux.empty(SITES), rays, (900.0, 903.0))
+    pilot_by(tracer, 32, anchored=anchored, mild=mild)
+    assert tracer.mild == told == {mild}
+
+
+@pytest.mark.parametrize(("name", "depth", "events", "others"), [
+    ("davis346", 2, True, False), ("gen2", 2, True, False), ("reference-mono", 2, False, False),
+    ("davis346", 4, False, False), ("gen2", 4, False, False),
+])  # fmt: skip
+def test_who_takes_the_mild_scatter(name, depth, events, others):
+    """Event pixels in whose windows no edge goes far, or whose pilot starts in a wide area; under direct light."""
+    scene = hr.load_scene("rotating-star", {"max_depth": depth})
+    renderer = ChangeDrivenFlux(scene, hr.load_sensor(name).crop(16, 8), seed=4)._renderer
+    for role, mild in (("events", events), ("any", others)):
+        assert {band.mild for band in renderer.bands(np.arange(8, dtype=np.uint32), role)} == {mild}
 
 
 def test_a_known_first_window_is_not_traced():
@@ -332,14 +381,14 @@ def test_rays_of_constant_pixels_count_as_those_of_pilots():
     """28 before, 40 more of this band: manifest and estimate have the sum."""
     tracer = SimpleNamespace(rays_done=1000)
 
-    def traced(index, window, windows, rays, width_px, near_us):
-        assert (rays, width_px, near_us) == (8, 1.5, (3.0, 9.0)) and window.tolist() == [0] * 5
+    def traced(index, window, windows, rays, width_px, near_us, mild):
+        assert (rays, width_px, near_us, mild) == (8, 1.5, (3.0, 9.0), True) and window.tolist() == [0] * 5
         tracer.rays_done += rays * index.size
         return None, None
 
     tracer.pilot_rays = traced
     own = SimpleNamespace(tracer=tracer, counts=SimpleNamespace(pilot_rays=28), _footprint_px=lambda band: 1.5)
-    band = SimpleNamespace(sites=SimpleNamespace(size=5, index=np.arange(5)), pilot_rays=8)
+    band = SimpleNamespace(sites=SimpleNamespace(size=5, index=np.arange(5)), pilot_rays=8, mild=True)
     AdaptiveRenderer.pilot_rays(own, band, SimpleNamespace(span_us=(0.0, 10.0)), (3.0, 9.0))
     assert own.counts.pilot_rays == 68
 

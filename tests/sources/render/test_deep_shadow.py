@@ -147,7 +147,12 @@ def test_pixels_that_lie_apart_are_looked_at_in_a_block(monkeypatch, apart, wind
         _sensor=SimpleNamespace(spec=SimpleNamespace(geometry=SimpleNamespace(cols=20))),
     )  # fmt: skip
     band = SimpleNamespace(
-        sites=Sites.alone(INDEX), apart=apart, pilot_rays=32, quality=0.6, unit=lambda flux: flux / np.float32(10)
+        sites=Sites.alone(INDEX),
+        apart=apart,
+        pilot_rays=32,
+        quality=0.6,
+        mild=True,
+        unit=lambda flux: flux / np.float32(10),
     )
     times, numbers = Windows(np.arange(windows) * 4.0, np.arange(windows) * 4.0 + 3), np.zeros((windows, 5), int)
     pilot, got = AdaptiveRenderer.pilot(own, band, times, numbers, None)

@@ -287,7 +287,7 @@ def test_looks_that_halve_find_what_all_looks_find(monkeypatch):
     assert np.ptp(every, axis=0).max() > 0.2 * every.max() and fewer < 0.7 * most
     assert np.mean(every != some) < 0.05
     unit = source.noise_unit(pixels, every, True)
-    assert np.sqrt(np.mean(((every - some) / unit) ** 2)) < 0.05
+    assert np.sqrt(np.mean(((every - some) / unit) ** 2)) < 0.08
 
 
 class MadeUp:
@@ -299,14 +299,14 @@ class MadeUp:
         self.light, self.near, self.traced = light, near, []
         self.rays, self.parts = SimpleNamespace(spreads=False), SimpleNamespace(groups=[])
 
-    def pilot(self, index, window, windows, rays, width_px, span_us=None, before=None):
+    def pilot(self, index, window, windows, rays, width_px, span_us=None, before=None, mild=False):
         self.traced += zip(window.tolist(), index.tolist(), strict=True)
         found = PilotFlux.empty(index.size)
         found.controlled[:], found.plain[:] = self.light[window, index], 0.5 * self.light[window, index]
         found.controlled_change[:], found.met[:] = 3000 + (before[1] if before else 0), self.near[index]
         return found
 
-    def pilot_rays(self, index, window, windows, rays, width_px, span_us=None, before=None):
+    def pilot_rays(self, index, window, windows, rays, width_px, span_us=None, before=None, mild=False):
         zeros = jit().Float(np.zeros(rays * index.size, np.float32))
         return self.pilot(index, window, windows, rays, width_px, before=before), PilotRays(
             zeros, zeros, rays, (5.0, 6.0)

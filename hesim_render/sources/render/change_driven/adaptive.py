@@ -86,9 +86,10 @@ class AdaptiveRenderer:
         index, lattice = self.index[pixel], self.noise.lattice(role)
         order, apart, tuning = np.argsort(index, kind="stable"), self.noise.is_apart(role), self.tuning
         rays = tuning.lone_pilot_rays if apart else tuning.pilot_rays
-        quality = self.quality
+        # where edges cross a pixel within a window, strata gain less; a pilot in a wide area sees more than its pixel
+        quality, mild = self.quality, self.tracer.is_diffuse and (apart or not self.has_ticks)
         if role == "any":
-            rays, quality = tuning.frame_pilot_rays, quality / tuning.frame_margin
+            rays, quality, mild = tuning.frame_pilot_rays, quality / tuning.frame_margin, False
         for first in range(0, order.size, _BAND_PIXELS):
             place = order[first : first + _BAND_PIXELS]
             # a single window is not followed through time, and needs no pixels beside those that lie apart
@@ -96,7 +97,7 @@ class AdaptiveRenderer:
                 sites = Sites.alone(index[place])
             else:
                 sites = Sites.around(index[place], lattice)
-            yield Band(place, sites, self.noise.of(role, sites.index), apart, rays, quality)
+            yield Band(place, sites, self.noise.of(role, sites.index), apart, rays, quality, mild)
 
     def pilot(
         self,
@@ -130,7 +131,7 @@ class AdaptiveRenderer:
         def wanted(flux: NDArray[np.float32]) -> NDArray[np.float32]:
             return np.float32(band.quality) * band.unit(flux)
 
-        pilot, near = take_pilot(*given, wanted)
+        pilot, near = take_pilot(*given, wanted, band.mild)
         if band.apart and pilot.windows > 2:
             # no neighbour tells when deep shadow ends
             seen = pilot.steady_flux, pilot.unshadowed
@@ -144,7 +145,7 @@ class AdaptiveRenderer:
         before, sites = self.tracer.rays_done, band.sites
         first = np.zeros(sites.size, np.int64)
         given = sites.index, first, windows, band.pilot_rays, self._footprint_px(band), near_us
-        anchored = Anchored(*self.tracer.pilot_rays(*given), windows.span_us, near_us)
+        anchored = Anchored(*self.tracer.pilot_rays(*given, mild=band.mild), windows.span_us, near_us)
         self.counts.pilot_rays += self.tracer.rays_done - before
         return anchored
 

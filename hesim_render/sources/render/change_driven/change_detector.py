@@ -22,8 +22,9 @@ from hesim_render.sources.render.change_driven.windows import Windows
 
 #: Rays of the detector.
 DETECTOR_RAYS = 8
-#: Largest scatter of single rays of an even pixel, in wanted errors; with 1 or 4, errors and rays are the same.
-_EVEN = np.float32(2.0)
+#: Largest scatter of single rays of an even pixel, in wanted errors; with 1 or 4, errors and rays are the same. Of one
+#: deviating ray in 32, the mild scatter is this part.
+_EVEN, _MILD = np.float32(2.0), np.float32(32**-0.25)
 #: Relative differences of fluxes that rounding explains, and differences over the wanted error that count as none.
 _ROUNDING, _SAME = np.float32(1e-5), np.float32(0.2)
 #: Maps the flux of each site to the wanted error of a pair, both [site], e⁻/s.
@@ -75,6 +76,7 @@ def windows_with_changes(
     near: NDArray[np.bool_],
     wanted: Wanted,
     width_px: float,
+    mild: bool = False,
 ) -> NDArray[np.bool_]:
     """Windows between the first and the last one in which the pilot looks with all its rays, [window, site].
 
@@ -93,10 +95,12 @@ def windows_with_changes(
     near : [site], True where anything may change.
     wanted : wanted error of each site.
     width_px : width of the area in which the rays start, px.
+    mild : take the mild scatter, see `PilotFlux`.
     """
     count, size = numbers.shape
+    most = _EVEN * _MILD if mild else _EVEN
     flux, scatter = _better(first)
-    even = near & (scatter <= _EVEN * wanted(flux))
+    even = near & (scatter <= most * wanted(flux))
     place = np.flatnonzero(even)
     # [window, site]; `seen` where few rays have looked
     new, seen = np.zeros((2, count, size), np.bool_)
@@ -106,6 +110,7 @@ def windows_with_changes(
         got = tracer.pilot(
             *(sites.index[site], numbers[window, site], windows, DETECTOR_RAYS, width_px, Stream.RENDER_DETECTOR),
             repeat=number,
+            mild=mild,
         )
         flux_there, scatter_there = _better(got)
         # what this set saw of each site the last time, and when
@@ -117,7 +122,7 @@ def windows_with_changes(
             some, level, spread = site[begin:end], last.copy(), np.zeros(size, np.float32)
             level[some], spread[some] = flux_there[begin:end], scatter_there[begin:end]
             if now:
-                differs = (np.abs(level - last) > least_change(last, wanted)) | (spread > _EVEN * wanted(level))
+                differs = (np.abs(level - last) > least_change(last, wanted)) | (spread > most * wanted(level))
                 new[now, some], seen[now, some] = differs[some], True
                 if sites.board is not None:
                     # in windows since the last look, in which these rays did not look

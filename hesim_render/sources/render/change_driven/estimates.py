@@ -73,6 +73,7 @@ class Band:
     apart : True if the pixels have no direct neighbours.
     pilot_rays : pilot rays per pixel and window.
     quality : wanted error in noise units.
+    mild : take the mild scatter of the pilot's rays, see `PilotFlux`.
     """
 
     place: NDArray[np.int64]
@@ -81,6 +82,7 @@ class Band:
     apart: bool
     pilot_rays: int
     quality: float
+    mild: bool
 
     @property
     def index(self) -> NDArray[np.uint32]:

@@ -76,7 +76,8 @@ class PilotFlux:
     controlled, plain : mean flux, e⁻/s, float32.
     controlled_scatter, plain_scatter : scatter of single rays, e⁻/s, float32: the root of the mean fourth power of
         deviations over their mean square. It equals the standard deviation if half of the rays give one value and half
-        another. It is larger if few rays deviate, because stratification then gains less.
+        another. It is larger if few rays deviate, because stratification then gains less. A *mild* scatter is the
+        geometric mean of the two, the fourth root of the mean fourth power.
     unshadowed : flux if nothing hid any light, e⁻/s, float32.
     met : see `PairFlux`.
     controlled_change, plain_change : standard deviation of the difference of single rays to the same rays in another
@@ -108,6 +109,7 @@ class PilotFlux:
         samples: int,
         alike: int,
         before: tuple[PilotRays, NDArray[np.integer]] | None = None,
+        mild: bool = False,
     ) -> None:
         """Put in the statistics of pairs.
 
@@ -120,12 +122,13 @@ class PilotFlux:
         alike : number of successive rays that are of one kind, all or half of them. Scatter is that within each kind.
         before : the same rays in other windows, and [n] the pair among them to compare each pair with; None where there
             is none.
+        mild : take the mild scatter.
         """
         types, rays = jit(), RayStatistics(len(met) // samples, samples, alike)
         dr.eval(controlled, plain, unshadowed, met)
         results: dict[str, Float | UInt32] = {"unshadowed": rays.mean(unshadowed), "met": rays.any_bits(met)}
         for values, name in ((controlled, "controlled"), (plain, "plain")):
-            results[name], results[f"{name}_scatter"] = rays.mean_and_scatter(values)
+            results[name], results[f"{name}_scatter"] = rays.mean_and_scatter(values, mild)
         if before is not None:
             others, pair = before
             first = types.UInt32(pair.astype(np.uint32)) * dr.opaque(types.UInt32, samples)

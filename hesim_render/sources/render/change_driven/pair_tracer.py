@@ -101,6 +101,7 @@ class PairTracer(PacketTracer):
         before: tuple[PilotRays, NDArray[np.integer]] | None = None,
         kept: Sequence[Float] | None = None,
         repeat: int = 0,
+        mild: bool = False,
     ) -> PilotFlux:
         """Statistics of a few rays of every listed pair, with random numbers of their own.
 
@@ -117,6 +118,7 @@ class PairTracer(PacketTracer):
         kept : [n · samples] each, where the fluxes of single rays are put, by both estimators, e⁻/s on the optical
             axis. They are large, so the journal keeps nothing of such a pass.
         repeat : number of the set of random numbers.
+        mild : take the mild scatter, see `PilotFlux`.
 
         Returns
         -------
@@ -132,9 +134,18 @@ class PairTracer(PacketTracer):
             aimed = None if aims is None else aims.part(part)
             compared = None if before is None else (before[0], before[1][part])
             others = () if compared is None else (compared[0].spans_us, compared[1])
-            inputs = "pilot", *lanes, samples, footprint_px, stream, *flux_inputs(windows, span_us, aimed), *others
+            inputs = (
+                "pilot",
+                *lanes,
+                samples,
+                footprint_px,
+                stream,
+                mild,
+                *flux_inputs(windows, span_us, aimed),
+                *others,
+            )
             trace = partial(
-                self._pilot_block, lanes, moments, key, samples, footprint, aimed, out, part, compared, kept
+                self._pilot_block, lanes, moments, key, samples, footprint, aimed, out, part, compared, kept, mild
             )
             remembered(self._journal if kept is None else None, self._run_part + inputs, out, part, trace)
             self._report((part.stop - first) * samples)
@@ -153,10 +164,12 @@ class PairTracer(PacketTracer):
         footprint_px: float,
         span_us: tuple[float, float] | None = None,
         before: tuple[PilotRays, NDArray[np.integer]] | None = None,
+        mild: bool = False,
     ) -> tuple[PilotFlux, PilotRays]:
         """As `pilot`, and the fluxes of the single rays, to compare the same rays in other windows with."""
         kept, used = [dr.empty(jit().Float, pixel.size * samples) for _ in range(2)], np.unique(window)
-        out = self.pilot(pixel, window, windows, samples, footprint_px, span_us=span_us, before=before, kept=kept)
+        given = pixel, window, windows, samples, footprint_px
+        out = self.pilot(*given, span_us=span_us, before=before, kept=kept, mild=mild)
         spans_us = *windows.begin_us[used].tolist(), *windows.end_us[used].tolist()
         return out, PilotRays(kept[0], kept[1], samples, spans_us)
 
@@ -290,13 +303,14 @@ class PairTracer(PacketTracer):
         part: slice,
         before: tuple[PilotRays, NDArray[np.integer]] | None,
         kept: Sequence[Float] | None,
+        mild: bool,
     ) -> None:
         """Statistics of some pairs, each with the same number of rays, and their single rays where they are kept."""
         packets = np.full(lanes[0].size, samples // PACKET)
         # all rays belong to the first half
         traced = self._packets_of(lanes, packets, packets * PACKET, moments, key, footprint, aims).fluxes
         # rays that are aimed are a kind of their own: their mean differs from that of the others
-        out.put(part, *traced, samples, samples if aims is None else samples // 2, before)
+        out.put(part, *traced, samples, samples if aims is None else samples // 2, before, mild)
         if kept is not None:
             types = jit()
             place = dr.opaque(types.UInt32, part.start * samples) + dr.arange(types.UInt32, len(traced[0]))

@@ -148,6 +148,7 @@ def take_pilot(
     known: PilotFlux | None = None,
     stride: int = 1,
     wanted: Wanted | None = None,
+    mild: bool = False,
 ) -> tuple[Pilot, NDArray[np.bool_]]:
     """Trace the pilot pass.
 
@@ -163,6 +164,7 @@ def take_pilot(
     known : results of the first window, where they are known and nothing is compared.
     stride : number of windows from one look to the next; between two looks that show the same, nothing is traced.
     wanted : maps the flux of each site to the wanted error of a pair, both e⁻/s; needed where `stride` is above 1.
+    mild : take the mild scatter, see `PilotFlux`.
 
     Returns
     -------
@@ -175,13 +177,13 @@ def take_pilot(
     if known is not None:
         first = known
     elif anchored is None:
-        first = tracer.pilot(sites.index, numbers[0], *given, span_us=span_us)
+        first = tracer.pilot(sites.index, numbers[0], *given, span_us=span_us, mild=mild)
     elif anchored.tells(span_us) and _is_window(anchored.window_us, windows, numbers[0]):
         # the first window is the anchor itself, whose rays are known
         first, own_rays = anchored.flux, anchored.rays
     else:
         before = anchored.rays, every
-        first, own_rays = tracer.pilot_rays(sites.index, numbers[0], *given, span_us=span_us, before=before)
+        first, own_rays = tracer.pilot_rays(sites.index, numbers[0], *given, span_us=span_us, before=before, mild=mild)
     knows = tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
     near = first.met if knows else np.ones(sites.size, np.bool_)
 
@@ -190,13 +192,14 @@ def take_pilot(
         compared = None
         if anchored is not None and own_rays is not None:
             compared = joined(own_rays, anchored.rays), place + np.where(window == count - 1, sites.size, 0)
-        return tracer.pilot(sites.index[place], numbers[window, place], *given, before=compared)
+        return tracer.pilot(sites.index[place], numbers[window, place], *given, before=compared, mild=mild)
 
     looks = Looks(first, count, near, look)
     if count > 1 and near.any():
         if stride == 1 and rays > DETECTOR_RAYS and wanted is not None and count > 2:
             # few rays tell which windows show anything new
-            looks.wherever(windows_with_changes(tracer, sites, numbers, windows, first, near, wanted, width_px))
+            of = tracer, sites, numbers, windows, first, near, wanted, width_px, mild
+            looks.wherever(windows_with_changes(*of))
         else:
             looks.every(stride, sites, wanted)
     tables = [looks.tables[name] for name in STATISTICS]

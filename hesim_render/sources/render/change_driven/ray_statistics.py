@@ -58,8 +58,9 @@ class RayStatistics:
         )
         return either
 
-    def mean_and_scatter(self, values: Float) -> tuple[Float, Float]:
-        """Mean of the rays of each pair, and the root of the mean fourth power of deviations over their mean square.
+    def mean_and_scatter(self, values: Float, mild: bool = False) -> tuple[Float, Float]:
+        """Mean of the rays of each pair, and the root of the mean fourth power of deviations over their mean square; of
+        a `mild` scatter the fourth root of the mean fourth power.
 
         Deviations are those from the mean of each kind: what differs between kinds is no scatter.
         """
@@ -74,7 +75,10 @@ class RayStatistics:
             return self._at(values, ray) - dr.select(ray < self._alike, early, late) * self._kind_share
 
         unit, second, fourth = self._powers(deviation)
-        return (early + late) * self._share, unit * dr.sqrt(dr.select(second > 0, fourth / second, 0) * self._unbiased)
+        # the choice is no part of the kernel, so that one serves both
+        is_mild = dr.opaque(jit().Bool, mild)
+        square = dr.select(is_mild, dr.sqrt(fourth * self._share), dr.select(second > 0, fourth / second, 0))
+        return (early + late) * self._share, unit * dr.sqrt(square * self._unbiased)
 
     def change(self, values: Float, before: Float, first_before: UInt32) -> Float:
         """Standard deviation of the difference of single rays to the same rays in another window, [n].
