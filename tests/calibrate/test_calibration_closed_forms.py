@@ -557,7 +557,7 @@ def test_goodness_weighs_on_and_off_by_their_own_covariance(monkeypatch):
     counts = np.stack([trials * chance[k] + 1.5 + shared + rng.normal(0, 5, 400) for k in (0, 1)])
     pixels = SimpleNamespace(
         is_dark=np.array([True, True]), cells=SimpleNamespace(trials=trials), single=lambda k: k, counts=counts,
-        signal_dn=np.zeros(400), weight=None,
+        signal_dn=np.zeros(400),
     )  # fmt: skip
     monkeypatch.setattr(event_goodness, "probability", lambda _, k, *__: np.full(400, chance[k]))
     found = event_goodness.goodness(pixels, np.zeros(6), 0.7, "linear", 1)

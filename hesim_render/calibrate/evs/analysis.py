@@ -325,23 +325,3 @@ def step_in_ln(captures: CaptureSet, steps: Steps, fit: EventFit) -> NDArray[np.
     # the same change of the signal as one of the voltage, whose offset makes it smaller
     k = coefficients(from_natural(fit.values))
     return np.log(voltage(k, steps.signal_dn * np.exp(steps.contrast)) / voltage(k, steps.signal_dn))
-
-
-def bootstrap_errors(result: EvsCalibration, samples: int, seed: int) -> NDArray[np.float64]:
-    """Standard errors [4] of A, B, C, D from resampling the pixels (Poisson bootstrap), without the error of θ.
-
-    Parameters
-    ----------
-    result : the calibration.
-    samples : number of resamplings.
-    seed : seed of the random numbers.
-    """
-    rng = np.random.default_rng(seed + 1)
-    good, fit = ~result.bad, result.together
-    values = []
-    for _ in range(samples):
-        # a Poisson number of copies of each pixel is a resampling of all
-        weight = rng.poisson(1.0, good.shape)
-        pixels = pool_events(result.static, good & (weight > 0), result.known, None, weight)
-        values.append(fit_events(pixels, result.theta_v, fit.law, fit.parameters, fit.free).values[:4])
-    return np.std(values, axis=0, ddof=1)

@@ -54,7 +54,7 @@ def goodness(pixels: PixelCounts, parameters: NDArray, theta_v: float, law: Law,
             group = _groups(pixels.signal_dn, np.minimum(*means) / effect)
 
         def total(values: NDArray, group: NDArray = group) -> NDArray[np.float64]:
-            return np.bincount(group, values if pixels.weight is None else values * pixels.weight).astype(np.float64)
+            return np.bincount(group, values).astype(np.float64)
 
         expected = [np.maximum(total(mean), 1e-9) for mean in means]
         # the scatter relative to counting is that of several groups together: a few events do not determine it
