@@ -27,7 +27,7 @@ from hesim_render.calibrate.estimate import Spread, estimated
 from hesim_render.calibrate.evs import checks as event_checks
 from hesim_render.calibrate.evs import counts, dispersion
 from hesim_render.calibrate.evs import fitted as fitted_events
-from hesim_render.calibrate.evs import goodness as event_goodness
+from hesim_render.calibrate.evs import model as event_goodness
 from hesim_render.calibrate.evs.analysis import _with_conversion_error, step_in_ln
 from hesim_render.calibrate.evs.cells import PixelThresholds, pool_events
 from hesim_render.calibrate.evs.checks import curve_levels

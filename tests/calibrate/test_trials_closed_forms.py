@@ -13,7 +13,7 @@ from hesim_render.calibrate.asynchronous import trials as trials_module
 from hesim_render.calibrate.asynchronous.likelihood import LEAK, NAMES, RESPONSE
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
 from hesim_render.calibrate.evs import fitted, medians, steps
-from hesim_render.calibrate.evs import goodness as good_fit
+from hesim_render.calibrate.evs import model as good_fit
 from hesim_render.calibrate.evs.cells import Cells, PixelThresholds, brightness_edges, pool_events
 from hesim_render.calibrate.evs.model import log_likelihood, log_probability
 from hesim_render.calibration.spec import Defect

@@ -13,10 +13,17 @@ from hesim_render.calibrate.evs.cells import PixelCounts, PixelThresholds, pool_
 from hesim_render.calibrate.evs.counts import StaticCapture
 from hesim_render.calibrate.evs.defects import EventDefects, bad_event_pixels, bad_in_steps, classify
 from hesim_render.calibrate.evs.dispersion import Dispersion, dispersion_in_time, static_mismatch
-from hesim_render.calibrate.evs.fitted import NO_FIT, EventFit, best_start, fit_events, with_mismatch_error
+from hesim_render.calibrate.evs.fitted import (
+    NO_FIT,
+    Ends,
+    EventFit,
+    best_start,
+    fit_events,
+    multi_start,
+    with_mismatch_error,
+)
 from hesim_render.calibrate.evs.medians import Typical
 from hesim_render.calibrate.evs.model import Law, coefficients, from_natural
-from hesim_render.calibrate.evs.starts import Ends, multi_start
 from hesim_render.calibrate.evs.steps import Steps, read_steps
 from hesim_render.calibrate.evs.thresholds import Thresholds, fit_thresholds, why_not
 from hesim_render.calibrate.moments import Progress
