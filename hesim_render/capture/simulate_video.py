@@ -1,4 +1,8 @@
-"""Simulate a sensor in front of a video: RAW frames and events from pictures instead of a rendered scene."""
+"""Simulate a sensor in front of a video: RAW frames and events from pictures instead of a rendered scene.
+
+What a run has given so far, and its state then, go into a journal: an interrupted run goes on without asking its source
+again for what has passed.
+"""
 
 from __future__ import annotations
 

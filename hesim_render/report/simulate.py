@@ -85,7 +85,7 @@ def _region(sensor: Sensor, size: tuple[int, int], per_tile: tuple[int, int]) ->
 
 
 class FrameInstrument:
-    """A bench with a simulated sensor on it.
+    """An instrument that takes the captures of EMVA 1288 with a simulated sensor: even light of one wavelength.
 
     Parameters
     ----------

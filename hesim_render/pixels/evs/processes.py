@@ -7,6 +7,8 @@ Where the bandwidth of the noise differs from pixel to pixel, with f_c the ``pho
 deviate of the pixel, r and c of `NoiseSpreadSpec`::
 
     f = f_c · exp(bandwidth_rel · z) · (1 ± r)(1 ± c)
+
+with plus in odd rows and columns of the event grid of the full sensor. The noise keeps its variance.
 """
 
 from __future__ import annotations
