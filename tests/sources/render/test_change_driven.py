@@ -9,8 +9,6 @@ from rendering import mono, pair_tracer, traced
 from test_renderer_pairs import DIFFUSE, LAMP, SKY, plane, sphere
 
 import hesim_render as hr
-from hesim_render.capture.loop import Capture
-from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.errors import RangeError, SpecError, TooLongError
 from hesim_render.mosaic.schedule import instant_blocks, tick_blocks
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
@@ -101,30 +99,6 @@ def test_a_crop_is_the_full_sensor(name):
     whole = fluxes(ChangeDrivenFlux(scene, sensor, seed=3), 0, 25_000).reshape(-1, 2, 48, 64)
     part = fluxes(ChangeDrivenFlux(scene, sensor.crop(24, 16, 7, 11), seed=3), 0, 25_000).reshape(-1, 2, 16, 24)
     np.testing.assert_allclose(part, whole[:, :, 11:27, 7:31], rtol=1e-6)
-
-
-@pytest.mark.parametrize("reference", ["previous_sample", "last_event"])
-def test_a_run_goes_on_where_another_one_stopped(reference):
-    changes = NOISE if reference == "previous_sample" else {"evs.threshold_mismatch_rel": 0.02}
-    is_tick = reference == "previous_sample"
-    sensor = hr.load_sensor("reference-mono" if is_tick else "davis346", changes).crop(
-        *((32, 24) if is_tick else (16, 12))
-    )
-    half_us = 12_500 if is_tick else 8000
-    keys = [{"t_us": 0, "rotation_deg": 0}, {"t_us": 200_000, "rotation_deg": -360}]
-    scene = hr.load_scene("rotating-star", {"motion": [{"object": "target", "keyframes": keys}]})
-
-    def run(begin_us, end_us, pixels=None):
-        source = ChangeDrivenFlux(scene, sensor, seed=4)
-        capture = Capture(source, source.sensor, *noise_models(sensor), end_us, 5, begin_us=begin_us, pixels=pixels)
-        parts = [item for item in capture.run() if isinstance(item, np.ndarray)]
-        return np.concatenate(parts), capture.pixel_state
-
-    whole, _ = run(0, 2 * half_us)
-    first, state = run(0, half_us)
-    second, _ = run(half_us, 2 * half_us, state)
-    assert first.size > 20 and second.size > 20
-    np.testing.assert_array_equal(np.sort(np.concatenate([first, second])), np.sort(whole))
 
 
 def test_instants_are_the_same_however_long_the_run():
