@@ -1,4 +1,4 @@
-"""What there is (``info``): the machine, names that can be used, the figures of a sensor; files to begin with (``new``)."""
+"""What there is (``info``): the machine, names to be used, figures of a sensor; and files to begin with (``new``)."""
 
 from __future__ import annotations
 
