@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import tee
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,14 +32,12 @@ from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.frame import Frame
+from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import with_crosstalk
 from hesim_render.sources.protocol import FluxSource, Sample
 from hesim_render.sources.renderer import Demand
 from hesim_render.sources.still import StillFlux
-
-if TYPE_CHECKING:
-    from hesim_render.recording.writer import RecordingWriter
 
 
 class Capture:
