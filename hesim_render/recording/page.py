@@ -86,9 +86,7 @@ def draw_rates(recording: Recorded, axes: Axes) -> None:
 def draw_histogram(recording: Recorded, axes: Axes) -> None:
     """RAW values of the middle frame, of each filter."""
     frame, mosaic = recording.frames[len(recording.frames) // 2], recording.mosaic
-    tile = mosaic.tile_channel
-    rows, cols = frame.raw.shape
-    channel = np.tile(tile, (-(-rows // tile.shape[0]), -(-cols // tile.shape[1])))[:rows, :cols]
+    channel = mosaic.tiled(mosaic.tile_channel, frame.raw.shape)
     largest = 2**mosaic.bit_depth - 1
     values = frame.raw[frame.valid]
     low, high = (float(v) for v in np.quantile(values, [0.0, 1.0])) if values.size else (0.0, float(largest))
