@@ -9,6 +9,8 @@ from rendering import mono, pair_tracer, traced
 from test_renderer_pairs import DIFFUSE, LAMP, SKY, plane, sphere
 
 import hesim_render as hr
+from hesim_render.capture.loop import Capture
+from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.errors import RangeError, SpecError, TooLongError
 from hesim_render.mosaic.schedule import instant_blocks, tick_blocks
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
@@ -99,6 +101,37 @@ def test_a_crop_is_the_full_sensor(name):
     whole = fluxes(ChangeDrivenFlux(scene, sensor, seed=3), 0, 25_000).reshape(-1, 2, 48, 64)
     part = fluxes(ChangeDrivenFlux(scene, sensor.crop(24, 16, 7, 11), seed=3), 0, 25_000).reshape(-1, 2, 16, 24)
     np.testing.assert_allclose(part, whole[:, :, 11:27, 7:31], rtol=1e-6)
+
+
+@pytest.mark.parametrize("reference", ["previous_sample", "last_event"])
+def test_a_run_goes_on_where_another_one_stopped(reference):
+    """With another renderer, which has not seen what came before."""
+    changes = NOISE if reference == "previous_sample" else {"evs.threshold_mismatch_rel": 0.02}
+    is_tick = reference == "previous_sample"
+    sensor = hr.load_sensor("reference-mono" if is_tick else "davis346", changes).crop(
+        *((32, 24) if is_tick else (16, 12))
+    )
+    half_us = 12_500 if is_tick else 8000
+    keys = [{"t_us": 0, "rotation_deg": 0}, {"t_us": 200_000, "rotation_deg": -360}]
+    scene = hr.load_scene("rotating-star", {"motion": [{"object": "target", "keyframes": keys}]})
+
+    def new_run():
+        source = ChangeDrivenFlux(scene, sensor, seed=4)
+        return Capture(source, source.sensor, *noise_models(sensor), 2 * half_us, 5)
+
+    def events_of(items):
+        return np.concatenate([item for item in items if isinstance(item, np.ndarray)])
+
+    whole, begun, first = events_of(new_run().run()), new_run(), []
+    for item in begun.run():
+        first.append(item)
+        if begun.progress[0] >= half_us:
+            break
+    second = new_run()
+    second.go_on(begun.state())
+    parts = events_of(first), events_of(second.run())
+    assert parts[0].size > 20 and parts[1].size > 20 and parts[0]["t_us"].max() <= half_us + 1000
+    np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.sort(whole))
 
 
 def test_instants_are_the_same_however_long_the_run():
