@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
-
-from numpy.typing import NDArray
 
 from hesim_render.calibrate.aps.calibration import described_captures
+from hesim_render.calibrate.asynchronous import output as trials_output
 from hesim_render.calibrate.asynchronous.analysis import analyse_trials
 from hesim_render.calibrate.asynchronous.trials import is_asynchronous
+from hesim_render.calibrate.evs import output
 from hesim_render.calibrate.evs.analysis import analyse
 from hesim_render.calibrate.evs.counts import event_tile, read_static
 from hesim_render.calibrate.moments import Progress
-from hesim_render.recording.capture_set import CaptureSet, read_captures
+from hesim_render.calibrate.report.page import write_report
+from hesim_render.calibrate.result import check_calibration, check_report, write_section
+from hesim_render.recording.capture_set import read_captures
 
 
 def calibrate_evs(
@@ -48,8 +49,6 @@ def calibrate_evs(
     OutputError
         If a result cannot be written.
     """
-    from hesim_render.calibrate.result import check_calibration, check_report, write_section
-
     captures = read_captures(folder)
     check_calibration(out, described_captures(captures))
     if report is not None:
@@ -57,34 +56,15 @@ def calibrate_evs(
     tell = progress or (lambda what, fraction: None)
     tell("reading event counts", 0.0)
     if is_asynchronous(captures):
-        section, maps = _asynchronous(captures, seed, tell)
+        trials = analyse_trials(captures, seed, tell)
+        event_tile(captures, trials.steps.shape)
+        section, maps = trials_output.content(trials), trials_output.maps(trials)
     else:
-        section, maps = _fixed_ticks(captures, out, tell, seed)
+        counts = analyse(captures, read_static(captures, out), seed, tell)
+        section, maps = output.content(captures, counts), output.maps(captures, counts)
     tell("writing", 0.95)
     write_section(out, "evs", described_captures(captures), section, maps)
     if report is not None:
-        from hesim_render.calibrate.report.page import write_report
-
         write_report(out, report, overwrite)
     tell("done", 1.0)
     return Path(out)
-
-
-def _fixed_ticks(
-    captures: CaptureSet, out: str | Path, tell: Progress, seed: int
-) -> tuple[dict[str, Any], dict[str, NDArray]]:
-    """Section and maps of a sensor with fixed comparisons."""
-    from hesim_render.calibrate.evs.output import content, maps
-
-    static = read_static(captures, out)
-    result = analyse(captures, static, seed, tell)
-    return content(captures, result), maps(captures, result)
-
-
-def _asynchronous(captures: CaptureSet, seed: int, tell: Progress) -> tuple[dict[str, Any], dict[str, NDArray]]:
-    """Section and maps of a sensor without fixed comparisons."""
-    from hesim_render.calibrate.asynchronous.output import content, maps
-
-    result = analyse_trials(captures, seed, tell)
-    event_tile(captures, result.steps.shape)
-    return content(result), maps(result)
