@@ -50,12 +50,12 @@ class LocalWorkers:
     ----------
     order : from `order_of`.
     count : number of processes.
-    threads : threads of the renderer in each; 0 divides the processors among them.
     """
 
-    def __init__(self, order: str, count: int, threads: int = 0) -> None:
+    def __init__(self, order: str, count: int) -> None:
         self._order, self._count = order, count
-        self._threads = threads or max(1, processors() // count)
+        #: Threads of the renderer in each: the processors are divided among them.
+        self._threads = max(1, processors() // count)
         self._waits = selectors.DefaultSelector()
         self._workers: list[_Worker] = []
 

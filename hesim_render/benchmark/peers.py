@@ -15,8 +15,15 @@ from numpy.typing import NDArray
 
 from hesim_render import __version__
 from hesim_render.benchmark.metrics import chamfer, count_error, quiet_rates, timing
-from hesim_render.benchmark.peer_pictures import exposures_us, pictures, write_pictures, write_settings
-from hesim_render.benchmark.peer_run import program_of, run_peer, version_of
+from hesim_render.benchmark.peer_run import (
+    exposures_us,
+    pictures,
+    program_of,
+    run_peer,
+    version_of,
+    write_pictures,
+    write_settings,
+)
 from hesim_render.benchmark.plan import chosen_sensor, file_of
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.run_settings import noise_models

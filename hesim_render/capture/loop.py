@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import tee
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,14 +32,12 @@ from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.frame import Frame
+from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import with_crosstalk
 from hesim_render.sources.protocol import FluxSource, Sample
 from hesim_render.sources.renderer import Demand
 from hesim_render.sources.still import StillFlux
-
-if TYPE_CHECKING:
-    from hesim_render.recording.writer import RecordingWriter
 
 
 class Capture:
@@ -53,10 +50,7 @@ class Capture:
     aps, evs : noise models, from `noise_models`.
     duration_us : end of the run, µs.
     seed : seed of all temporal noise.
-    begin_us : begin of the run, µs. The times of frames and comparisons do not depend on it; a frame belongs to the
-        run in which it ends.
-    pixels : state of the event pixels at the end of the previous run (`pixel_state`); together they equal one run.
-    labels : label each event with its cause; not for a run that continues another.
+    labels : label each event with its cause.
 
     Attributes
     ----------
@@ -71,12 +65,9 @@ class Capture:
         evs: EvsNoise | None,
         duration_us: int,
         seed: int,
-        begin_us: int = 0,
-        pixels: SavedState | None = None,
         labels: bool = False,
     ) -> None:
-        self._sensor, self._seed = sensor, seed
-        self._begin_us, self._duration_us = begin_us, duration_us
+        self._sensor, self._seed, self._duration_us = sensor, seed, duration_us
         layout = sensor.layout
         # frame pixels and event pixels share one source, unless crosstalk is switched off for one of the two
         sources = {n.crosstalk: with_crosstalk(flux, layout.shape, n.crosstalk) for n in (aps, evs) if n is not None}
@@ -86,20 +77,15 @@ class Capture:
         )
         self._aps_pixel = frame_pixels(sensor, aps)
         self._evs_pixel = layout.evs_pixel.ravel() if evs is not None else np.empty(0, np.uint32)
-        every = exposures(aps.spec, layout.rows, duration_us) if aps is not None else []
-        self._exposures = [exposure for exposure in every if exposure.end_us > begin_us]
+        self._exposures = exposures(aps.spec, layout.rows, duration_us) if aps is not None else []
         self._is_static = flux.is_static
         if flux.is_static:
             frame_source, self._event_source = self._still(frame_source)
         self._frames = OpenFrames(sensor, aps, self._exposures, frame_source, seed)
-        self.labeller = Labeller(evs, seed, begin_us, duration_us) if labels and evs is not None else None
+        self.labeller = Labeller(evs, seed, duration_us) if labels and evs is not None else None
         self._stage = EvsStage(evs, seed, labels=self.labeller) if evs is not None else None
-        if self._stage is not None and pixels is not None:
-            self._stage.resume(pixels)
-        self._known_us = self._stage.t_us if self._stage is not None else None
         #: Number of event samples taken, and time that has been simulated, µs.
-        self._samples, self._t_us = 0, begin_us
-        self._pixel_state: SavedState = {}
+        self._samples, self._t_us = 0, 0
         self._event_flux = EventFlux(self._evs_pixel.size)
         self.errors = {"frames": self._frames.errors, "events": ErrorMeter()}
 
@@ -116,23 +102,10 @@ class Capture:
         """Mosaic indices of the event pixels, [n], in the order of the event grid."""
         return self._evs_pixel
 
-    @property
-    def pixel_state(self) -> SavedState:
-        """State of the event pixels at the end of the run, for a run that continues it; plain values, NumPy arrays."""
-        return self._pixel_state
-
     def event_blocks(self) -> Iterator[Block]:
         """Blocks of windows for which the source is asked for the flux of event pixels."""
-        if self._stage is None:
-            return
-        spec, known_us = self._stage.noise.spec, self._known_us
-        if spec.reference == "previous_sample" or known_us is None:
-            yield from self._blocks_between(self._begin_us, self._duration_us)
-            return
-        # the state of the previous run holds its last sample
-        blocks = self._blocks_between(known_us - spec.window_us, self._duration_us)
-        next(blocks)
-        yield from blocks
+        if self._stage is not None:
+            yield from self._blocks_between(0, self._duration_us)
 
     def _blocks_between(self, begin_us: float, end_us: float) -> Iterator[Block]:
         """Blocks of windows of a run between two times."""
@@ -148,7 +121,7 @@ class Capture:
             return BlockSample([], 1.0)
         tick_us = self._stage.noise.spec.tick_us
         stretch_us = BLOCK_INTERVALS * tick_us if tick_us is not None else BLOCK_CELLS * CELL_US
-        return sample_of_blocks(self._blocks_between, stretch_us, self._begin_us, self._duration_us, self._seed)
+        return sample_of_blocks(self._blocks_between, stretch_us, 0, self._duration_us, self._seed)
 
     @property
     def frame_exposures(self) -> tuple[NDArray[np.uint32], list[Exposure]]:
@@ -182,10 +155,7 @@ class Capture:
         return self._t_us, self._duration_us
 
     def state(self) -> SavedState:
-        """State between two items that `run` yields: plain values, NumPy arrays. Not of labels and errors of a render.
-
-        Unlike `pixel_state`, it belongs to the same run, and holds frames in exposure.
-        """
+        """State between two items of `run`: plain values, NumPy arrays. Not of labels and errors of a render."""
         return {
             "samples": self._samples,
             "t_us": self._t_us,
@@ -230,8 +200,6 @@ class Capture:
             yield self._compare(next(samples), int(end_us))
             if progress is not None:
                 progress(min(end_us, self._duration_us), self._duration_us, "simulated µs")
-        if self._stage is not None:
-            self._pixel_state = self._pixel_state or self._stage.state()
         while piece is not None:
             yield from self._frames.expose(piece)
             if progress is not None and self._stage is None:
@@ -298,13 +266,11 @@ class Capture:
     def _compare(self, sample: Sample, t_us: int) -> NDArray:
         """Events up to a sample."""
         assert self._stage is not None
-        if t_us > self._duration_us:
-            self._pixel_state = self._stage.state()
-        else:
+        if t_us <= self._duration_us:
             self._event_flux.add(sample.half_a, sample.half_b)
         events = self._step(sample.half_a, sample.half_b, t_us)
         self._samples, self._t_us = self._samples + 1, min(t_us, self._duration_us)
-        return events[(events["t_us"] > self._begin_us) & (events["t_us"] <= self._duration_us)]
+        return events[(events["t_us"] > 0) & (events["t_us"] <= self._duration_us)]
 
     def _step(self, half_a: Float, half_b: Float, t_us: int) -> NDArray:
         assert self._stage is not None

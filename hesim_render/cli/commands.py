@@ -15,8 +15,6 @@ from hesim_render.cli import (
     exchange,
     info,
     measure,
-    new,
-    report,
     simulate,
     study,
     view,
@@ -48,7 +46,7 @@ def _app(
 
 for _command in (
     simulate.simulate, view.view, view.isp, exchange.export, exchange.import_, measure.measure, measure.compare,
-    report.report, cube.cube, study.study, simulate.demo, info.info, new.new,
+    measure.report, cube.cube, study.study, simulate.demo, info.info, info.new,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"))(_command)
 app.add_typer(calibrate.app, name="calibrate")

@@ -1,4 +1,4 @@
-"""What there is: the machine, names that can be used, and the figures of a sensor (``info``)."""
+"""What there is (``info``): the machine, names to be used, figures of a sensor; and files to begin with (``new``)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import typer
 from hesim_render.cli.console import Console, Json
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.options import HelpAll, Overwrite, SensorKeys, names_of, sensor_keys_only
-from hesim_render.cli.terminal import complain, split_overrides
+from hesim_render.cli.terminal import complain, say, split_overrides
 from hesim_render.core.errors import ConflictError, RangeError, did_you_mean
-from hesim_render.core.output import free_place
+from hesim_render.core.output import free_place, replacing
 from hesim_render.core.shipped import list_names
 
 #: Keys of a sensor file that its line needs.
@@ -37,6 +37,8 @@ _TRUTH = {
     "light": "level of each light, every ms",
     "events": "cause and object of each event, lost events, and the events without noise",
 }
+#: Kinds of sensors that there is a template for.
+_KINDS = ("frames", "events", "hybrid")
 
 
 class Kind(StrEnum):
@@ -220,3 +222,37 @@ def _sensor_cells(row: Mapping[str, Any]) -> list[str]:
     sizes = [(noun, row[f"{noun}_px"]) for noun in ("frames", "events")]
     sizes_text = [f"no {noun}" if size is None else f"{noun} {size[0]}x{size[1]}" for noun, size in sizes]
     return [*sizes_text, f"{row['pitch_um']:>5g} µm"]
+
+
+def _kinds_and_names(incomplete: str) -> list[str]:
+    return [kind for kind in _KINDS if kind.startswith(incomplete)] + names_of("sensors")(incomplete)
+
+
+def new(
+    out: Annotated[Path, typer.Argument(help="sensor file to write, such as mine.yaml")],
+    like: Annotated[
+        str,
+        typer.Option(
+            help=f"a template with comments for {', '.join(_KINDS)}, or a shipped sensor to copy (see 'info sensors')",
+            autocompletion=_kinds_and_names,
+        ),
+    ] = "hybrid",
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a sensor file to start from.
+
+    A template in which comments explain every key, or a copy of a shipped one.
+    """
+    free_place(out, overwrite, (".yaml", ".yml"))
+    from hesim_render.sensor.template import sensor_copy, sensor_template
+
+    if like in _KINDS:
+        text = sensor_template(out.stem, like)
+    elif like in list_names("sensors"):
+        text = sensor_copy(out.stem, like)
+    else:
+        known = (*_KINDS, *list_names("sensors"))
+        raise RangeError("--like", like, f"one of {', '.join(known)}{did_you_mean(like, known)}")
+    with replacing(out) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+    say(f"{out}: a sensor file; look at it with 'hesim-render info {out}'")

@@ -24,10 +24,6 @@ import numpy as np
 Float: TypeAlias = Any
 #: Array of 64-bit floats.
 Float64: TypeAlias = Any
-#: Array of signed whole numbers of 8 bits: polarities.
-Int8: TypeAlias = Any
-#: Array of signed whole numbers of 32 bits.
-Int32: TypeAlias = Any
 #: Array of unsigned whole numbers of 32 bits: indices, DN, random words, seeds of rays.
 UInt32: TypeAlias = Any
 #: Array of unsigned whole numbers of 64 bits: keys of generators.
@@ -38,14 +34,10 @@ Mask: TypeAlias = Any
 Point2: TypeAlias = Any
 Point3: TypeAlias = Any
 Vector3: TypeAlias = Any
-#: 3×3 or 4×4 Floats: a rotation, or a rigid transform.
-Matrix: TypeAlias = Any
 #: An array of a kind that the caller chooses.
 DeviceArray: TypeAlias = Any
 #: A counter-based generator of random words, ``Philox4x32``.
 Generator: TypeAlias = Any
-#: The module that has the array types, as `jit` gives it: ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
-DeviceTypes: TypeAlias = Any
 #: A number, a NumPy array, or an array on the device: what a formula takes.
 Values: TypeAlias = Any
 

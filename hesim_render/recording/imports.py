@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +16,9 @@ from hesim_render.recording.camera_raw import CAMERA_SUFFIXES, read_camera_raw, 
 from hesim_render.recording.dng import is_packed
 from hesim_render.recording.exports import mosaic_encoding
 from hesim_render.recording.frame import Frame
+from hesim_render.recording.recording import Recording
 from hesim_render.recording.writer import RecordingWriter
-
-if TYPE_CHECKING:
-    from hesim_render.recording.recording import Recording
-    from hesim_render.sensor.sensor import Sensor
+from hesim_render.sensor.sensor import Sensor
 
 
 def import_recording(

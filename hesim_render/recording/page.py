@@ -6,6 +6,7 @@ Plots of a recording: its pictures, events over time, and the distribution of RA
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,15 +21,12 @@ from hesim_render.core.yaml_file import write_yaml
 from hesim_render.events import event_rate
 from hesim_render.recording.outline import parameters, scene_name
 from hesim_render.recording.quality import render_lines
+from hesim_render.recording.recorded import Recorded
 from hesim_render.recording.showcase import contact_sheet, middle_views
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from hesim_render.recording.recorded import Recorded
 
 #: Intervals of the curve of event rates.
 _INTERVALS = 200
@@ -88,9 +86,7 @@ def draw_rates(recording: Recorded, axes: Axes) -> None:
 def draw_histogram(recording: Recorded, axes: Axes) -> None:
     """RAW values of the middle frame, of each filter."""
     frame, mosaic = recording.frames[len(recording.frames) // 2], recording.mosaic
-    tile = mosaic.tile_channel
-    rows, cols = frame.raw.shape
-    channel = np.tile(tile, (-(-rows // tile.shape[0]), -(-cols // tile.shape[1])))[:rows, :cols]
+    channel = mosaic.tiled(mosaic.tile_channel, frame.raw.shape)
     largest = 2**mosaic.bit_depth - 1
     values = frame.raw[frame.valid]
     low, high = (float(v) for v in np.quantile(values, [0.0, 1.0])) if values.size else (0.0, float(largest))

@@ -9,7 +9,7 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from ruamel.yaml.comments import CommentedMap
 
@@ -21,12 +21,10 @@ from hesim_render.core.yaml_file import read_yaml
 from hesim_render.sensor.from_data_sheet import derive
 from hesim_render.specs.event_pixels import DERIVED, SHEETS, EvsSpec
 from hesim_render.specs.files import apply_overrides, locate, validate
+from hesim_render.specs.frame_pixels import ApsSpec
 from hesim_render.specs.problems import line_of
 from hesim_render.specs.sensor import NoiseFile, NoisePart, SensorSpec, SheetSensorSpec
 from hesim_render.specs.sensor_checks import unused
-
-if TYPE_CHECKING:
-    from hesim_render.specs.frame_pixels import ApsSpec
 
 #: Shortest exposure that is not doubted, µs: shutters of cameras take about 10 µs at least.
 _SHORTEST_US = 10

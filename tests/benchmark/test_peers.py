@@ -12,8 +12,15 @@ import hesim_render as hr
 from hesim_render import cli
 from hesim_render.benchmark import peers
 from hesim_render.benchmark.metrics import nearest_us, quiet_rates, timing
-from hesim_render.benchmark.peer_pictures import encoded, exposures_us, pictures
-from hesim_render.benchmark.peer_run import PeerError, read_events, run_peer, version_of
+from hesim_render.benchmark.peer_run import (
+    PeerError,
+    encoded,
+    exposures_us,
+    pictures,
+    read_events,
+    run_peer,
+    version_of,
+)
 from hesim_render.benchmark.peers import compare_peers, peers_table
 from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.errors import SpecError

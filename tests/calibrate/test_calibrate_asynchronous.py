@@ -19,7 +19,7 @@ from hesim_render.calibrate.asynchronous.likelihood import first_event, log_prio
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials, read_trials
 from hesim_render.calibration.spec import Defect
 from hesim_render.capture.lab import write_captures
-from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.errors import SpecError
 from hesim_render.recording.capture_set import read_captures
 
 TRUTH = Pixels()
@@ -543,8 +543,6 @@ def test_sets_that_lack_a_file_or_belong_to_another_sensor(plain, tmp_path):
     np.savez(folder / "evs_static.npz", n_on=np.zeros((2, 2), int))
     with pytest.raises(SpecError, match=r"capture trials after a reset, evs_noise_rate\.npz and evs_s_curve\.npz"):
         calibrate_evs(folder, tmp_path / "c.yaml")
-    with pytest.raises(RangeError, match="bootstrap"):
-        calibrate_evs(plain[0], tmp_path / "d.yaml", bootstrap=10)
     damaged = spoiled(plain[0], tmp_path / "e", "")
     data = (damaged / "evs_s_curve.npz").read_bytes()
     (damaged / "evs_s_curve.npz").write_bytes(data[: len(data) // 2])

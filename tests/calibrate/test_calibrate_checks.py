@@ -13,7 +13,7 @@ from hesim_render.calibrate.aps import checks as frame_checks
 from hesim_render.calibrate.aps import common_mode
 from hesim_render.calibrate.evs import analysis as event_analysis
 from hesim_render.calibrate.evs import checks as event_checks
-from hesim_render.calibrate.evs import goodness as event_goodness
+from hesim_render.calibrate.evs import model as event_goodness
 from hesim_render.calibrate.evs import output as event_output
 from hesim_render.calibrate.evs.counts import read_static
 from hesim_render.calibrate.moments import FrameMoments
@@ -276,7 +276,7 @@ def test_searches_that_end_elsewhere_are_told(good_events):
     below[:3] = 27.0
     lost = replace(result, ends=replace(apart, log_likelihood_below=below))
     assert event_checks.check_events(lost, "voltage")[0] == []
-    study = event_output.content(captures, lost, None)["multi_start"]
+    study = event_output.content(captures, lost)["multi_start"]
     assert study["lost"] == 3 and max(study["largest_difference_in_standard_errors"]) < 0.3
     assert event_output.maps(captures, lost)["figure_starts"].shape == (197, 4)
 

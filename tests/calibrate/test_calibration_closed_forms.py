@@ -27,7 +27,7 @@ from hesim_render.calibrate.estimate import Spread, estimated
 from hesim_render.calibrate.evs import checks as event_checks
 from hesim_render.calibrate.evs import counts, dispersion
 from hesim_render.calibrate.evs import fitted as fitted_events
-from hesim_render.calibrate.evs import goodness as event_goodness
+from hesim_render.calibrate.evs import model as event_goodness
 from hesim_render.calibrate.evs.analysis import _with_conversion_error, step_in_ln
 from hesim_render.calibrate.evs.cells import PixelThresholds, pool_events
 from hesim_render.calibrate.evs.checks import curve_levels
@@ -557,7 +557,7 @@ def test_goodness_weighs_on_and_off_by_their_own_covariance(monkeypatch):
     counts = np.stack([trials * chance[k] + 1.5 + shared + rng.normal(0, 5, 400) for k in (0, 1)])
     pixels = SimpleNamespace(
         is_dark=np.array([True, True]), cells=SimpleNamespace(trials=trials), single=lambda k: k, counts=counts,
-        signal_dn=np.zeros(400), weight=None,
+        signal_dn=np.zeros(400),
     )  # fmt: skip
     monkeypatch.setattr(event_goodness, "probability", lambda _, k, *__: np.full(400, chance[k]))
     found = event_goodness.goodness(pixels, np.zeros(6), 0.7, "linear", 1)

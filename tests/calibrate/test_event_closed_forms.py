@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal, norm
 from hesim_render.calibrate.asynchronous import analysis as trials_analysis
 from hesim_render.calibrate.asynchronous import fit as trials_fit
 from hesim_render.calibrate.asynchronous import likelihood
-from hesim_render.calibrate.evs import analysis, dispersion, thresholds
+from hesim_render.calibrate.evs import dispersion, thresholds
 from hesim_render.calibrate.evs import fit as events_fit
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_probability
@@ -240,31 +240,6 @@ def test_middle_spread_and_leak_of_a_start():
         calm=np.array([[10, 10], [30, 50], [90, 90]]), edges_s=np.array([0.0, 0.1, 0.25]),
     )  # fmt: skip
     assert trials_fit._leak_start(steady) == pytest.approx(11.5 / (80 * 0.25))
-
-
-def test_errors_of_resampling_are_those_of_fits_to_weighted_pixels(monkeypatch):
-    """Each pixel that is not bad counts as often as a Poisson law of mean 1 says; those of weight 0 are left out."""
-    bad = np.array([False, True, False, False, False, False])
-    asked = []
-
-    def pool(static, some, known, steps, weight):
-        assert (static, known, steps) == ("static", "known", None)
-        np.testing.assert_array_equal(some, ~bad & (weight > 0))
-        asked.append(weight)
-        return weight
-
-    def fit(pixels, theta_v, law, parameters, free):
-        assert (theta_v, law, parameters, free) == (0.4, "sqrt", "p", "f")
-        return SimpleNamespace(values=np.array([*(pixels[:4] * [1.0, 3.0, 10.0, 0.5]), 99.0]))
-
-    monkeypatch.setattr(analysis, "pool_events", pool)
-    monkeypatch.setattr(analysis, "fit_events", fit)
-    together = SimpleNamespace(law="sqrt", parameters="p", free="f")
-    result = SimpleNamespace(bad=bad, together=together, static="static", known="known", theta_v=0.4)
-    error = analysis.bootstrap_errors(result, 5, 7)
-    drawn = np.random.default_rng(8).poisson(1.0, (5, 6))
-    np.testing.assert_array_equal(asked, drawn)
-    np.testing.assert_allclose(error, np.std(drawn[:, :4], axis=0, ddof=1) * [1.0, 3.0, 10.0, 0.5])
 
 
 @pytest.mark.parametrize(("law", "power"), [("sqrt", 1), ("linear", 2)])

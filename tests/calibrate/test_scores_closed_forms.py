@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from hesim_render.calibrate.evs import analysis, checks, defects, fit, fitted, goodness
+from hesim_render.calibrate.evs import analysis, checks, defects, fit, fitted, model
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_likelihood, log_probability
 from hesim_render.calibrate.flicker import dynamics, unsteady
@@ -55,20 +55,20 @@ def test_scores_are_slopes_of_the_likelihood(weighed):
 
 @pytest.mark.parametrize("weighed", [False, True])
 def test_the_covariance_is_that_of_the_scores_of_single_pixels(weighed, monkeypatch):
-    """Bread, meat and bread: a loop over 40 pixels with two counts each, so many times each; 7 are summed at once."""
+    """Bread, meat and bread: a loop over 40 pixels with two counts each; 7 are summed at once."""
     monkeypatch.setattr(fit, "_CHUNK", 7)
     rng = np.random.default_rng(2)
     cells, p = some_cells(rng)
     variance = 1.7 * cells.total * p * (1 - p) if weighed else None
     cell = np.stack([2 * rng.integers(0, 5, 40), 2 * rng.integers(0, 5, 40) + 1])
-    counts, weight = rng.binomial(500, p[cell]).astype(float), rng.integers(0, 3, 40).astype(float)
-    pixels = SimpleNamespace(signal_dn=np.zeros(40), counts=counts, cell=cell, weight=weight, cells=cells)
+    counts = rng.binomial(500, p[cell]).astype(float)
+    pixels = SimpleNamespace(signal_dn=np.zeros(40), counts=counts, cell=cell, cells=cells)
     slope = log_probability(ETA, cells, 2.3, "sqrt")[1] * FREE
     influence = slope / (1 - p)[:, None] if variance is None else slope * (cells.total * p / variance)[:, None]
     meat = np.zeros((6, 6))
     for k in range(40):
         score = sum((counts[j, k] - 500 * p[cell[j, k]]) * influence[cell[j, k]] for j in (0, 1))
-        meat += np.outer(score, score) * weight[k] ** 2
+        meat += np.outer(score, score)
     information = (slope * (cells.total * p)[:, None]).T @ influence
     bread = np.zeros((6, 6))
     bread[np.ix_(FREE, FREE)] = np.linalg.inv(information[np.ix_(FREE, FREE)])
@@ -81,7 +81,7 @@ def test_groups_of_brightness_hold_pixels_and_events():
     rng = np.random.default_rng(3)
     signal, events = rng.uniform(0, 9, 3000), rng.uniform(0.1, 0.5, 3000)
     for factor, enough in ((1.0, events.sum() / 20), (9.0, 100.0), (0.1, 10.0)):
-        group = goodness._groups(signal, factor * events)
+        group = model._groups(signal, factor * events)
         order = np.argsort(signal)
         assert np.all(np.diff(group[order]) >= 0)
         sizes, sums = np.bincount(group), np.bincount(group, factor * events)
@@ -90,14 +90,14 @@ def test_groups_of_brightness_hold_pixels_and_events():
         for k in range(sizes.size - 1):
             inside = order[group[order] == k]
             assert inside.size == 200 or sums[k] - factor * events[inside[-1]] < enough
-    wide = goodness._wider(np.array([60.0, 50, 30, 30, 50, 99, 3]))
+    wide = model._wider(np.array([60.0, 50, 30, 30, 50, 99, 3]))
     sums = np.bincount(wide, [60.0, 50, 30, 30, 50, 99, 3])
     assert np.all(np.diff(wide) >= 0) and sums[:-1].min() >= 60 and sums[-1] >= 100
 
 
 def test_a_goodness_without_degrees_of_freedom_says_nothing():
     for dof, per_dof, chance in ((9, 14.4 / 9, chi2.sf(14.4, 9)), (0, 1.0, 1.0), (-3, 1.0, 1.0)):
-        found = goodness.Goodness(14.4, dof)
+        found = model.Goodness(14.4, dof)
         assert (found.per_dof, found.p_value) == pytest.approx((per_dof, chance))
 
 

@@ -13,7 +13,7 @@ from hesim_render.calibrate.asynchronous import trials as trials_module
 from hesim_render.calibrate.asynchronous.likelihood import LEAK, NAMES, RESPONSE
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
 from hesim_render.calibrate.evs import fitted, medians, steps
-from hesim_render.calibrate.evs import goodness as good_fit
+from hesim_render.calibrate.evs import model as good_fit
 from hesim_render.calibrate.evs.cells import Cells, PixelThresholds, brightness_edges, pool_events
 from hesim_render.calibrate.evs.model import log_likelihood, log_probability
 from hesim_render.calibration.spec import Defect
@@ -22,18 +22,18 @@ from hesim_render.core.errors import SpecError
 
 @pytest.mark.parametrize("position", [None, 1])
 def test_cells_are_sums_over_pixels_of_like_brightness_and_threshold(position):
-    """A loop over 12 by 9 pixels, some of them counted twice or not at all; the dark is a brightness of its own."""
+    """A loop over 12 by 9 pixels, some of them not good; the dark is a brightness of its own."""
     rng, shape = np.random.default_rng(1), (12, 9)
     signal = rng.choice([5.0, 5.01, 80.0, 300.0], shape)
     counts = [rng.integers(0, 90, shape) for _ in range(4)]
-    good, weight = rng.random(shape) < 0.8, rng.integers(0, 3, shape)
+    good = rng.random(shape) < 0.8
     tile = np.add.outer(np.arange(12) % 2, np.arange(9) % 2)
     static = SimpleNamespace(
         signal_dn=signal, position=tile, sessions=[(signal, *counts[:2]), (0 * signal, *counts[2:])], trials=100
     )
     about = [1 + 0.02 * rng.standard_normal(shape) for _ in range(2)]
     known = PixelThresholds(*about, *rng.uniform(0.01, 0.1, (2, *shape)))
-    found = pool_events(static, good, known, position, weight)
+    found = pool_events(static, good, known, position)
     take = good if position is None else good & (tile == position)
     edges = brightness_edges(signal[good])
     sums = {}
@@ -44,14 +44,12 @@ def test_cells_are_sums_over_pixels_of_like_brightness_and_threshold(position):
                 at = tuple(place)
                 step = round(relative[at] / 0.01)
                 key = (session, k, 0 if session else np.searchsorted(edges, signal[at], side="right"), step)
-                sums.setdefault(key, []).append((weight[at], light[at], relative[at], left[at], events[at]))
+                sums.setdefault(key, []).append((light[at], relative[at], left[at], events[at]))
     wanted = []
     for key in sorted(sums):
-        w, x, r, own, n = np.array(sums[key]).T
-        total = max(w.sum(), 1e-30)
-        centre = w @ r / total
-        wanted.append((w @ x / total, 1.0 - 2 * key[1], centre, np.sqrt(w @ (own**2 + (r - centre) ** 2) / total),
-                       w.sum(), w @ n))  # fmt: skip
+        x, r, own, n = np.array(sums[key]).T
+        spread = np.sqrt(np.mean(own**2 + (r - r.mean()) ** 2))
+        wanted.append((x.mean(), 1.0 - 2 * key[1], r.mean(), spread, x.size, n.sum()))
     table = found.cells
     told = np.stack([table.signal_dn, table.polarity, table.relative, table.spread, table.pixels, table.events], axis=1)
     np.testing.assert_allclose(told, wanted, rtol=1e-9, atol=1e-12)
@@ -424,8 +422,7 @@ def test_pixels_are_unlike_the_fit_by_any_test_that_few_fail(monkeypatch):
     assert chunks == [3, 3, 3, 3, 2, 2]
 
 
-@pytest.mark.parametrize("weighed", [False, True])
-def test_goodness_is_the_quadratic_form_of_groups_with_their_own_scatter(weighed, monkeypatch):
+def test_goodness_is_the_quadratic_form_of_groups_with_their_own_scatter(monkeypatch):
     """Two sessions of 60 pixels in four groups, two wide ones; ON and OFF are correlated, and the dark is one group."""
     rng = np.random.default_rng(12)
     means = rng.uniform(3, 40, (4, 60)) * np.array([[1.0], [2.0], [0.1], [0.3]])
@@ -433,10 +430,9 @@ def test_goodness_is_the_quadratic_form_of_groups_with_their_own_scatter(weighed
     noise[1] = 0.6 * noise[0] + 0.8 * noise[1]
     counts = means + 1.4 * np.sqrt(means) * noise
     group, wide = np.arange(60) % 4, np.array([0, 1, 1, 0])
-    weight = rng.integers(0, 3, 60) if weighed else None
     pixels = SimpleNamespace(
         is_dark=np.array([False, False, True, True]), cells=SimpleNamespace(trials=50), counts=counts,
-        single=lambda k: k, signal_dn=np.arange(60.0), weight=weight,
+        single=lambda k: k, signal_dn=np.arange(60.0),
     )  # fmt: skip
     asked = []
 
@@ -448,21 +444,20 @@ def test_goodness_is_the_quadratic_form_of_groups_with_their_own_scatter(weighed
     monkeypatch.setattr(good_fit, "_groups", lambda signal, events: asked.append(events) or group)
     monkeypatch.setattr(good_fit, "_wider", wider)
     found = good_fit.goodness(pixels, np.zeros(6), 0.3, "sqrt", 5)
-    each = np.ones(60) if weight is None else weight
     chi2 = 0.0
     for on, off, number, wider in ((0, 1, group, wide), (2, 3, 0 * group, np.zeros(1, int))):
         residual = counts[[on, off]] - means[[on, off]]
         effect = max(1.0, *(np.sum(residual**2, axis=1) / means[[on, off]].sum(axis=1)))
         alike = [number == g for g in range(number.max() + 1)]
-        expected = np.array([[(each * means[k])[some].sum() for some in alike] for k in (on, off)])
+        expected = np.array([[means[k][some].sum() for some in alike] for k in (on, off)])
         if on == 0:
             np.testing.assert_allclose(asked[0], np.minimum(means[0], means[1]) / effect)
         np.testing.assert_allclose(asked[1 if on == 0 else 2], expected.min(axis=0) / effect)
         for g, some in enumerate(alike):
             near = np.isin(number, np.flatnonzero(wider == wider[g]))
             size = expected[:, wider == wider[g]].sum(axis=1)
-            matrix = (each * residual)[:, near] @ residual[:, near].T / np.sqrt(np.outer(size, size))
-            total = (each * residual)[:, some].sum(axis=1) / np.sqrt(expected[:, g])
+            matrix = residual[:, near] @ residual[:, near].T / np.sqrt(np.outer(size, size))
+            total = residual[:, some].sum(axis=1) / np.sqrt(expected[:, g])
             chi2 += total @ np.linalg.solve(matrix, total)
     assert found.chi2 == pytest.approx(chi2) and found.dof == 2 * 5 - 5
 

@@ -36,15 +36,6 @@ class RampFlux(WindowByWindow):
         return types.Float(flux * (1 + self.split)), types.Float(flux * (1 - self.split))
 
 
-class WaveFlux(RampFlux):
-    """Φ = (1 + col) · base · (1 + 0.8 sin(2π t / 7 ms)) in the middle of each window."""
-
-    def mean_flux(self, pixel, begin_us, end_us):
-        middle = 0.5 * (np.asarray(begin_us, dtype=float) + np.asarray(end_us, dtype=float))
-        flux = self.base * (1.0 + pixel % self.cols) * (1 + 0.8 * np.sin(2 * np.pi * middle / 7000))
-        return (jit().Float(flux),) * 2
-
-
 def run(flux, sensor, duration_us, clean=True, seed=1):
     aps, evs = noise_models(sensor, clean=clean)
     frames, events = [], []
@@ -61,27 +52,6 @@ def test_exposures_end_inside_the_run_and_carry_their_times():
     assert [e.start_us for e in exposures(spec, 384, 400_000)] == [0, 125_000, 250_000, 375_000]
     blocks = tick_blocks(hr.load_sensor("eiger").spec.evs, 0, 5000)
     assert [t for block in blocks for t in block.end_us[block.wanted]] == [1239, 2478, 3717, 4956]
-
-
-def test_a_source_that_takes_one_window_after_another_hands_on_its_pixels():
-    """Fixed comparisons: exact runs and videos go on where they stopped, with all noise."""
-    sensor = hr.load_sensor("gen2", {"evs.threshold_mismatch_rel": 0.05}).crop(24, 16)
-
-    def part(begin_us, end_us, pixels=None):
-        capture = Capture(WaveFlux(sensor), sensor, *noise_models(sensor), end_us, 3, begin_us=begin_us, pixels=pixels)
-        items = list(capture.run())
-        events = [item for item in items if isinstance(item, np.ndarray)]
-        frames = [item.raw for item in items if not isinstance(item, np.ndarray)]
-        return np.concatenate(events), frames, capture.pixel_state
-
-    whole, frames, _ = part(0, 200_000)
-    first, early, state = part(0, 94_000)
-    second, late, _ = part(94_000, 200_000, state)
-    assert first.size > 100 and second.size > 100
-    np.testing.assert_array_equal(np.concatenate([first, second]), whole)
-    np.testing.assert_array_equal(early + late, frames)
-    fresh, _, _ = part(94_000, 200_000)
-    assert fresh.size != second.size or np.any(fresh != second)
 
 
 @pytest.mark.parametrize("edges", [(), np.arange(137.0, 100_000, 137.0)], ids=["one slice", "many slices"])

@@ -10,9 +10,9 @@ from PIL import Image
 from videos import encode, moving_bar, rgb_frames
 
 import hesim_render as hr
-from hesim_render.capture import kept_run
+from hesim_render.capture import simulate_video as kept_run
 from hesim_render.core.errors import OutputError
-from hesim_render.exchange import dsec_writer
+from hesim_render.exchange import dsec
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.recording.frame import Frame
 from hesim_render.sources.video.linear import Lineariser
@@ -145,7 +145,7 @@ def test_the_length_of_parts_changes_no_byte(clip, tmp_path, monkeypatch):
     """Each part has several blocks of events, which are kept as one; the blocks decide the layout of the file."""
     monkeypatch.setattr(kept_run, "time", SimpleNamespace(monotonic=itertools.count().__next__))
     monkeypatch.setattr(kept_run, "_MOST_EVENTS", 400)
-    monkeypatch.setattr(dsec_writer, "_CHUNK", 50)
+    monkeypatch.setattr(dsec, "_CHUNK", 50)
     record("asynchronous", clip, tmp_path / "whole", monkeypatch, resume=False)
     for part_s in (0, 5):  # of a clock that counts how often it is asked
         out = tmp_path / str(part_s)

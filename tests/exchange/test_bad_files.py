@@ -16,7 +16,7 @@ import hesim_render as hr
 from hesim_render.cli import main
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
 from hesim_render.exchange import EVENT_FORMATS, EventStream, aedat4, dsec, open_events, raw_file
-from hesim_render.exchange.dsec_writer import EventFileWriter
+from hesim_render.exchange.dsec import EventFileWriter
 from hesim_render.recording.exports import SUFFIXES, import_events
 
 READABLE = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "npz")

@@ -46,7 +46,7 @@ def light(t_us, swing=0.6, hz=20.0):
 
 def run(noise, times_us, level=light, labels=True, seed=9):
     """All events, and the labeller."""
-    labeller = Labeller(noise, seed, 0, int(times_us[-1])) if labels else None
+    labeller = Labeller(noise, seed, int(times_us[-1])) if labels else None
     stage = EvsStage(noise, seed, labels=labeller)
     parts = [
         stage.step(jit().Float(((np.exp(level(t)) - 1) / 2).astype(np.float32)), int(t)) for t in times_us
@@ -311,7 +311,7 @@ def test_labels_neither_drift_nor_need_more_memory_as_time_goes_on(dead_us):
     """Lamps that blink, by 5 thresholds between two samples, with noise and thresholds of each pixel's own."""
     noise = model(True, {**NOISY, "beta4": 2.0}, evs__threshold_mismatch_rel=0.1, evs__leak_rate_hz=1.3,
                   **({} if dead_us is None else {"evs.refractory_period_us": dead_us}))  # fmt: skip
-    labeller = Labeller(noise, 9, 0, 10**9)
+    labeller = Labeller(noise, 9, 10**9)
     stage = EvsStage(noise, 9, labels=labeller)
     generator = np.random.default_rng(4)
     held, shares = [], []
@@ -335,7 +335,7 @@ def test_what_is_let_go_of_changes_no_label(monkeypatch):
     found = []
     for few in (0, 10**9):
         monkeypatch.setattr(partners, "_FEW", few)
-        labeller = Labeller(noise, 9, 0, 10**9)
+        labeller = Labeller(noise, 9, 10**9)
         stage = EvsStage(noise, 9, labels=labeller)
         for t in TICKS:
             stage.step(jit().Float(((np.exp(light(t)) - 1) / 2).astype(np.float32)), int(t))

@@ -220,7 +220,7 @@ def test_origin_and_label():
     event that a drifted reference gives in addition.
     """
     noise = pixels({"process": "drift", "rate_hz": 4.0, "spread_rel": 0.1})
-    labeller = Labeller(noise, 3, 0, 10**9)
+    labeller = Labeller(noise, 3, 10**9)
     stage = EvsStage(noise, 3, labels=labeller)
     bright = jit().Float(np.full(PIXELS, 9.0, np.float32))
     stage.step(bright, 1_000)

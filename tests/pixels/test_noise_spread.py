@@ -8,8 +8,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs.model import EvsNoise
-from hesim_render.pixels.evs.noise_spread import bandwidth_map, most_bandwidth
-from hesim_render.pixels.evs.processes import BandNoise
+from hesim_render.pixels.evs.processes import BandNoise, bandwidth_map, most_bandwidth
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.sensor.reading import read_sensor
 from hesim_render.sensor.sensor import load_sensor

@@ -11,8 +11,8 @@ from ruamel.yaml import YAML
 import hesim_render as hr
 from hesim_render.exchange import open_events
 from hesim_render.pixels.evs.events import no_events
+from hesim_render.report import simulate as frames
 from hesim_render.report import simulated
-from hesim_render.report import simulated_frames as frames
 from hesim_render.report.simulated import REFERENCE_LUX, Instrument
 from hesim_render.sensor.from_data_sheet import electrons_per_s_lux
 from hesim_render.spectral.spectrum import illuminant

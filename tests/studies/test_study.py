@@ -24,7 +24,7 @@ from hesim_render.spectral import spectrum as spectra
 from hesim_render.studies import Table, channel_noise, verdict, with_filter_set
 from hesim_render.studies import report as study_report
 from hesim_render.studies.filter_sets import filters_of, mixing
-from hesim_render.studies.plots import pareto_front, pareto_plot
+from hesim_render.studies.report import pareto_front, pareto_plot
 from hesim_render.studies.run import study
 from hesim_render.studies.table import has_parquet
 from hesim_render.studies.verdict import ranking

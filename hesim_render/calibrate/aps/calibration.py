@@ -20,6 +20,7 @@ from hesim_render.calibrate.aps.photon_transfer import linearity, photon_transfe
 from hesim_render.calibrate.aps.telegraph import TelegraphMaps, find_telegraph
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance, join, pool, variance_map
 from hesim_render.calibrate.moments import FrameMoments, Progress, measure
+from hesim_render.calibrate.report.page import write_report
 from hesim_render.calibrate.result import check_calibration, check_report, write_section
 from hesim_render.core.errors import SpecError
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
@@ -82,8 +83,6 @@ def calibrate_aps(
         maps(captures, result, lit, dark),
     )
     if report is not None:
-        from hesim_render.calibrate.report.page import write_report
-
         write_report(out, report, overwrite)
     return Path(out)
 

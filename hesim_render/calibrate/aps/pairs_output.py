@@ -18,6 +18,7 @@ from hesim_render.calibrate.aps.rounded_noise import levels_of
 from hesim_render.calibrate.aps.variance import TERMS
 from hesim_render.calibrate.estimate import Z_95, estimated, not_identifiable
 from hesim_render.calibrate.moments import Progress
+from hesim_render.calibrate.report.page import write_report
 from hesim_render.calibrate.result import check_calibration, check_report, write_section
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, polynomial
 from hesim_render.recording.pair_set import PairSet, read_pair_set
@@ -59,8 +60,6 @@ def calibrate_pairs(
     result = evaluate(pairs, progress)
     write_section(out, "aps", about, content(result), maps(result))
     if report is not None:
-        from hesim_render.calibrate.report.page import write_report
-
         write_report(out, report, overwrite)
     return result
 

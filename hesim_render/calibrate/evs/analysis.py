@@ -13,10 +13,17 @@ from hesim_render.calibrate.evs.cells import PixelCounts, PixelThresholds, pool_
 from hesim_render.calibrate.evs.counts import StaticCapture
 from hesim_render.calibrate.evs.defects import EventDefects, bad_event_pixels, bad_in_steps, classify
 from hesim_render.calibrate.evs.dispersion import Dispersion, dispersion_in_time, static_mismatch
-from hesim_render.calibrate.evs.fitted import NO_FIT, EventFit, best_start, fit_events, with_mismatch_error
+from hesim_render.calibrate.evs.fitted import (
+    NO_FIT,
+    Ends,
+    EventFit,
+    best_start,
+    fit_events,
+    multi_start,
+    with_mismatch_error,
+)
 from hesim_render.calibrate.evs.medians import Typical
 from hesim_render.calibrate.evs.model import Law, coefficients, from_natural
-from hesim_render.calibrate.evs.starts import Ends, multi_start
 from hesim_render.calibrate.evs.steps import Steps, read_steps
 from hesim_render.calibrate.evs.thresholds import Thresholds, fit_thresholds, why_not
 from hesim_render.calibrate.moments import Progress
@@ -325,23 +332,3 @@ def step_in_ln(captures: CaptureSet, steps: Steps, fit: EventFit) -> NDArray[np.
     # the same change of the signal as one of the voltage, whose offset makes it smaller
     k = coefficients(from_natural(fit.values))
     return np.log(voltage(k, steps.signal_dn * np.exp(steps.contrast)) / voltage(k, steps.signal_dn))
-
-
-def bootstrap_errors(result: EvsCalibration, samples: int, seed: int) -> NDArray[np.float64]:
-    """Standard errors [4] of A, B, C, D from resampling the pixels (Poisson bootstrap), without the error of θ.
-
-    Parameters
-    ----------
-    result : the calibration.
-    samples : number of resamplings.
-    seed : seed of the random numbers.
-    """
-    rng = np.random.default_rng(seed + 1)
-    good, fit = ~result.bad, result.together
-    values = []
-    for _ in range(samples):
-        # a Poisson number of copies of each pixel is a resampling of all
-        weight = rng.poisson(1.0, good.shape)
-        pixels = pool_events(result.static, good & (weight > 0), result.known, None, weight)
-        values.append(fit_events(pixels, result.theta_v, fit.law, fit.parameters, fit.free).values[:4])
-    return np.std(values, axis=0, ddof=1)

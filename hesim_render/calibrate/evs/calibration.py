@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
-
-from numpy.typing import NDArray
 
 from hesim_render.calibrate.aps.calibration import described_captures
+from hesim_render.calibrate.asynchronous import output as trials_output
 from hesim_render.calibrate.asynchronous.analysis import analyse_trials
 from hesim_render.calibrate.asynchronous.trials import is_asynchronous
-from hesim_render.calibrate.evs.analysis import analyse, bootstrap_errors
+from hesim_render.calibrate.evs import output
+from hesim_render.calibrate.evs.analysis import analyse
 from hesim_render.calibrate.evs.counts import event_tile, read_static
 from hesim_render.calibrate.moments import Progress
-from hesim_render.core.errors import RangeError
-from hesim_render.recording.capture_set import CaptureSet, read_captures
+from hesim_render.calibrate.report.page import write_report
+from hesim_render.calibrate.result import check_calibration, check_report, write_section
+from hesim_render.recording.capture_set import read_captures
 
 
 def calibrate_evs(
@@ -22,7 +22,6 @@ def calibrate_evs(
     out: str | Path,
     report: str | Path | None = None,
     progress: Progress | None = None,
-    bootstrap: int = 0,
     seed: int = 0,
     overwrite: bool = False,
 ) -> Path:
@@ -36,9 +35,7 @@ def calibrate_evs(
         ``signal_dn``, the composite in its section ``aps`` is the signal: frames of the same scene.
     report : HTML file, if wanted; it covers every section of `out`, and an earlier report of `out` is replaced.
     progress : called with a text that names the current work and the fraction done.
-    bootstrap : number of resamplings of the pixels for a second opinion on the standard errors; of sensors with fixed
-        comparisons only.
-    seed : seed of the multi-start study and the bootstrap.
+    seed : seed of the multi-start study.
     overwrite : replace a report of another calibration.
 
     Returns
@@ -47,15 +44,11 @@ def calibrate_evs(
 
     Raises
     ------
-    RangeError
-        For a bootstrap of an asynchronous sensor.
     SpecError
         If the captures cannot be used; the message says what to capture instead.
     OutputError
         If a result cannot be written.
     """
-    from hesim_render.calibrate.result import check_calibration, check_report, write_section
-
     captures = read_captures(folder)
     check_calibration(out, described_captures(captures))
     if report is not None:
@@ -63,39 +56,15 @@ def calibrate_evs(
     tell = progress or (lambda what, fraction: None)
     tell("reading event counts", 0.0)
     if is_asynchronous(captures):
-        if bootstrap:
-            raise RangeError(
-                "bootstrap", bootstrap, "0 for an asynchronous sensor: its errors are the pixels' own scatter"
-            )
-        section, maps = _asynchronous(captures, seed, tell)
+        trials = analyse_trials(captures, seed, tell)
+        event_tile(captures, trials.steps.shape)
+        section, maps = trials_output.content(trials), trials_output.maps(trials)
     else:
-        section, maps = _fixed_ticks(captures, out, tell, bootstrap, seed)
+        counts = analyse(captures, read_static(captures, out), seed, tell)
+        section, maps = output.content(captures, counts), output.maps(captures, counts)
     tell("writing", 0.95)
     write_section(out, "evs", described_captures(captures), section, maps)
     if report is not None:
-        from hesim_render.calibrate.report.page import write_report
-
         write_report(out, report, overwrite)
     tell("done", 1.0)
     return Path(out)
-
-
-def _fixed_ticks(
-    captures: CaptureSet, out: str | Path, tell: Progress, bootstrap: int, seed: int
-) -> tuple[dict[str, Any], dict[str, NDArray]]:
-    """Section and maps of a sensor with fixed comparisons."""
-    from hesim_render.calibrate.evs.output import content, maps
-
-    static = read_static(captures, out)
-    result = analyse(captures, static, seed, tell)
-    errors = bootstrap_errors(result, bootstrap, seed) if bootstrap else None
-    return content(captures, result, errors), maps(captures, result)
-
-
-def _asynchronous(captures: CaptureSet, seed: int, tell: Progress) -> tuple[dict[str, Any], dict[str, NDArray]]:
-    """Section and maps of a sensor without fixed comparisons."""
-    from hesim_render.calibrate.asynchronous.output import content, maps
-
-    result = analyse_trials(captures, seed, tell)
-    event_tile(captures, result.steps.shape)
-    return content(result), maps(result)

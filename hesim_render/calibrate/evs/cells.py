@@ -109,7 +109,6 @@ class PixelCounts:
     Attributes
     ----------
     signal_dn, position : [pixel], signal in DN and number of the tile position.
-    weight : [pixel], number of times that a pixel counts, None for once.
     counts : [count, pixel], ON and OFF events of the lit scene and of the dark.
     polarity, is_dark : [count].
     relative, spread : [count, pixel], thresholds as in `PixelThresholds`.
@@ -119,7 +118,6 @@ class PixelCounts:
 
     signal_dn: NDArray[np.float64]
     position: NDArray[np.intp]
-    weight: NDArray[np.float64] | None
     counts: NDArray[np.float64]
     polarity: NDArray[np.float64]
     is_dark: NDArray[np.bool_]
@@ -159,7 +157,6 @@ def pool_events(
     good: NDArray[np.bool_],
     thresholds: PixelThresholds,
     position: int | None = None,
-    weight: NDArray | None = None,
 ) -> PixelCounts:
     """Sort the counts of good pixels into cells. The dark capture is a brightness of its own.
 
@@ -169,13 +166,11 @@ def pool_events(
     good : [row, col], pixels that are used.
     thresholds : known thresholds of the pixels.
     position : number of the tile position whose pixels are used; None for all.
-    weight : [row, col], number of times that a pixel counts (bootstrap).
     """
     # bins of all good pixels, so that cells do not depend on the chosen position
     edges = brightness_edges(static.signal_dn[good])
     take = good if position is None else good & (static.position == position)
     signal = static.signal_dn[take]
-    weights = None if weight is None else weight[take].astype(np.float64)
     bright = np.searchsorted(edges, signal, side="right")
     counts, polarities, is_dark, relatives, spreads, index = [], [], [], [], [], []
     columns: list[list[NDArray]] = [[] for _ in range(6)]
@@ -191,16 +186,15 @@ def pool_events(
             alike -= alike.min(initial=0)
             key = alike if session else bright * (alike.max(initial=0) + 1) + alike
             _, cell = np.unique(key, return_inverse=True)
-            pixels = np.bincount(cell, weights).astype(np.float64)
-            least = np.maximum(pixels, 1e-30)
+            pixels = np.bincount(cell).astype(np.float64)
 
-            def mean(values: NDArray, cell: NDArray = cell, least: NDArray = least) -> NDArray[np.float64]:
-                return np.bincount(cell, values if weights is None else values * weights) / least
+            def mean(values: NDArray, cell: NDArray = cell, pixels: NDArray = pixels) -> NDArray[np.float64]:
+                return np.bincount(cell, values) / pixels
 
             # mean threshold of each cell, and what is left of the spread about it
             centre = mean(r)
             within = np.sqrt(mean(left * left + (r - centre[cell]) ** 2))
-            values = mean(x), np.full(pixels.size, polarity), centre, within, pixels, mean(n) * least
+            values = mean(x), np.full(pixels.size, polarity), centre, within, pixels, mean(n) * pixels
             for column, value in zip(columns, values, strict=True):
                 column.append(value)
             counts.append(n)
@@ -213,6 +207,6 @@ def pool_events(
     signals, signs, centres, withins, numbers, events = (np.concatenate(column) for column in columns)
     cells = Cells(signals, signs, centres, withins, numbers, events, static.trials)
     return PixelCounts(
-        signal, np.broadcast_to(static.position, good.shape)[take], weights, np.stack(counts), np.array(polarities),
+        signal, np.broadcast_to(static.position, good.shape)[take], np.stack(counts), np.array(polarities),
         np.array(is_dark), np.stack(relatives), np.stack(spreads), np.stack(index), cells,
     )  # fmt: skip

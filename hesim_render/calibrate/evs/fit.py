@@ -227,7 +227,7 @@ def pixel_scores(
             (k[part] - cells.trials * p[cell[part]])[:, None] * influence[cell[part]]
             for k, cell in zip(pixels.counts, pixels.cell, strict=True)
         )
-        meat += score.T @ (score if pixels.weight is None else score * pixels.weight[part, None] ** 2)
+        meat += score.T @ score
     return meat, (slope * (cells.total * p)[:, None]).T @ influence
 
 

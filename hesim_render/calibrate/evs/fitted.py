@@ -1,4 +1,4 @@
-"""The event model fitted to pooled counts: the identified parameters and their errors."""
+"""The event model fitted to pooled counts: the identified parameters and their errors; searches from many starts."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from scipy.stats import chi2 as chi2_law
 
 from hesim_render.calibrate.evs.cells import Cells, PixelCounts
 from hesim_render.calibrate.evs.fit import maximise, sandwich, search, start_values
-from hesim_render.calibrate.evs.goodness import Goodness, goodness
 from hesim_render.calibrate.evs.model import (
+    Goodness,
     Law,
+    from_natural,
+    goodness,
     log_likelihood,
     log_probability,
     natural,
@@ -36,6 +38,10 @@ _CAPTURE = (
     "capture brighter scenes and more trials",
     "capture brighter scenes and more trials",
 )
+#: Searches of the multi-start study, which must end at one point.
+_STARTS = 200
+#: ln L below the best end from which an end does not describe the counts: 4 standard errors of a likelihood ratio.
+_TOO_UNLIKELY = 8.0
 
 
 @dataclass(frozen=True)
@@ -281,3 +287,54 @@ def with_mismatch_error(fit: EventFit, pixels: PixelCounts, theta_v: float, rela
     moved = fit_events(wider, theta_v, fit.law, fit.parameters, fit.free)
     change = np.where(fit.free, moved.values - fit.values, 0.0)
     return replace(fit, covariance=fit.covariance + np.outer(change, change))
+
+
+@dataclass(frozen=True)
+class Ends:
+    """Where the searches of the multi-start study ended.
+
+    Parameters
+    ----------
+    values : (A, B, C, D) [start, 4].
+    standard_error : [4], from the Fisher information; NaN for what is not free.
+    log_likelihood_below : [start], ln L of the best end minus that of this one.
+    """
+
+    values: NDArray[np.float64]
+    standard_error: NDArray[np.float64]
+    log_likelihood_below: NDArray[np.float64]
+
+    def describe_counts(self, chi2_per_dof: float) -> NDArray[np.bool_]:
+        """Whether each end is about as likely as the best, [start]. The others only say that a search was lost.
+
+        Parameters
+        ----------
+        chi2_per_dof : of the fit. Counts that scatter more than the binomial law has it make ln L differ by more.
+        """
+        return self.log_likelihood_below < _TOO_UNLIKELY * max(1.0, chi2_per_dof)
+
+
+def multi_start(pixels: PixelCounts, fit: EventFit, theta_v: float, seed: int) -> Ends:
+    """Maximum likelihood from many starts: A, B, C vary by e² in either direction, D over (−0.9, 0.9).
+
+    Parameters
+    ----------
+    pixels : counts. Of pixels with known thresholds those near the mean are used.
+    fit : the fit whose parameters the starts surround.
+    theta_v : Θ, threshold in V.
+    seed : seed of the starts.
+    """
+    rng = np.random.default_rng(seed)
+    begin = np.tile(fit.values, (_STARTS, 1))
+    free = np.array(fit.free)
+    spread = np.where(free[:3], rng.uniform(-2, 2, (_STARTS, 3)), 0)
+    begin[:, :3] *= np.exp(spread)
+    if free[3]:
+        begin[:, 3] = rng.uniform(-0.9, 0.9, _STARTS)
+    begin[:, 4:] = np.where(free[4:], 0.0, begin[:, 4:])
+    cells = pixels.cells.typical().coarser()
+    eta, fisher, _ = search(cells, from_natural(begin), theta_v, fit.law, fit.free)
+    values, covariance = natural(eta, np.linalg.pinv(fisher))
+    errors = np.sqrt(np.maximum(np.einsum("fii->fi", covariance)[:, :4], 0))
+    level = log_likelihood(cells, log_probability(eta, cells, theta_v, fit.law)[0])
+    return Ends(values[:, :4], np.where(free[:4], np.median(errors, axis=0), np.nan), level.max() - level)

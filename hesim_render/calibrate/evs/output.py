@@ -31,7 +31,7 @@ _MODEL = (
 )
 
 
-def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | None) -> dict[str, Any]:
+def content(captures: CaptureSet, result: EvsCalibration) -> dict[str, Any]:
     """The section ``evs``; a parameter that the data do not determine is null, with the reason."""
     fit, tile = result.together, result.static.tile
     findings, levels = check_events(result, captures.spec.contrast_of)
@@ -71,10 +71,6 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
         "defects": {kind.name.lower(): result.defects.count(kind) for kind in Defect if kind is not Defect.NONE},
         "multi_start": _multi_start(result),
     }
-    if bootstrap is not None:
-        section["bootstrap_standard_error"] = {
-            name: e if ok else None for name, e, ok in zip("ABCD", bootstrap, fit.free, strict=False)
-        }
     return section
 
 

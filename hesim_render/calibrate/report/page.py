@@ -7,8 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from hesim_render.calibrate.report.asynchronous import asynchronous_section
-from hesim_render.calibrate.report.events import evs_section
+from hesim_render.calibrate.report.events import asynchronous_section, evs_section
 from hesim_render.calibrate.report.frames import aps_section
 from hesim_render.calibrate.report.parts import plain_text
 from hesim_render.calibrate.result import check_report, read_calibration, read_maps, report_beginning

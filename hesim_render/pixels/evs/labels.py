@@ -39,12 +39,12 @@ class Labeller:
     ----------
     noise : the noise model of the stage.
     seed : seed of the stage.
-    begin_us, end_us : events after the begin and up to the end belong to the run, µs.
+    end_us : events after 0 and up to the end belong to the run, µs.
     """
 
-    def __init__(self, noise: EvsNoise, seed: int, begin_us: int, end_us: int) -> None:
+    def __init__(self, noise: EvsNoise, seed: int, end_us: int) -> None:
         self._cols = noise.layout.evs_shape[1]
-        self._span = begin_us, end_us
+        self._end_us = end_us
         nominal, own = noise.without(*_NOISE, "mismatch"), noise.without(*_NOISE)
         alike = isinstance(noise.threshold_on_map, float) and isinstance(noise.threshold_off_map, float)
         #: The noise-free stream, and with ticks the pixels with own thresholds if these differ.
@@ -112,7 +112,7 @@ class Labeller:
         return LabelBlock(*(np.concatenate([getattr(block, name) for block in every]) for name in names))
 
     def _of_run(self, events: NDArray[np.void]) -> NDArray[np.bool_]:
-        return (events["t_us"] > self._span[0]) & (events["t_us"] <= self._span[1])
+        return (events["t_us"] > 0) & (events["t_us"] <= self._end_us)
 
     def _in_run(self, events: NDArray[np.void]) -> NDArray[np.void]:
         return events[self._of_run(events)]

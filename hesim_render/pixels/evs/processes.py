@@ -2,6 +2,13 @@
 
 Both are functions of the seed, the pixel and the time of the first sample. They do not depend on how often they are
 asked.
+
+Where the bandwidth of the noise differs from pixel to pixel, with f_c the ``photoreceptor_cutoff_hz``, z a normal
+deviate of the pixel, r and c of `NoiseSpreadSpec`::
+
+    f = f_c · exp(bandwidth_rel · z) · (1 ± r)(1 ± c)
+
+with plus in odd rows and columns of the event grid of the full sensor. The noise keeps its variance.
 """
 
 from __future__ import annotations
@@ -15,11 +22,10 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Float64, UInt32
-from hesim_render.core.rng import Stream, normal_pair, philox, stream_key
+from hesim_render.core.rng import Stream, device_normal, normal_pair, philox, stream_key
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.formulas import POLE
 from hesim_render.pixels.evs.model import EvsNoise
-from hesim_render.pixels.evs.noise_spread import bandwidth_map, most_bandwidth
 from hesim_render.pixels.evs.photoreceptor import Photoreceptor
 
 #: Nodes of the noise per period of the photoreceptor's cut-off frequency.
@@ -222,3 +228,26 @@ class RandomEvents:
             yield np.array(due_us), np.array(pixel)
             again: UInt32 = dr.compress(following <= end_us)
             pixel = dr.gather(types.UInt32, pixel, again)
+
+
+def most_bandwidth(noise: EvsNoise) -> float:
+    """Largest bandwidth of a pixel's noise over photoreceptor_cutoff_hz."""
+    spread = noise.spec.noise_spread
+    return 1.0 if spread is None or "mismatch" in noise.off else spread.most
+
+
+def bandwidth_map(noise: EvsNoise) -> NDArray[np.float32] | None:
+    """Bandwidth of each event pixel's noise over photoreceptor_cutoff_hz, row-major; None where all are alike."""
+    spread, layout = noise.spec.noise_spread, noise.layout
+    if spread is None or "mismatch" in noise.off:
+        return None
+    index = layout.full_index.ravel()[layout.evs_pixel.ravel()]
+    places = np.divmod(index.astype(np.int64), layout.spec.geometry.cols)
+    factor = np.exp(spread.bandwidth_rel * device_normal(noise.device_seed, Stream.NOISE_SPREAD, index))
+    for axis, part in enumerate((spread.odd_rows_rel, spread.odd_cols_rel)):
+        # row, or column, of the event grid of the full sensor
+        size = layout.tile_shape[axis]
+        inside = np.unique([position[axis] for position in layout.spec.positions("evs")])
+        line = places[axis] // size * inside.size + np.searchsorted(inside, places[axis] % size)
+        factor = factor * (1 + part * (2 * (line % 2) - 1))
+    return np.minimum(factor, spread.most).astype(np.float32)

@@ -40,7 +40,7 @@ from hesim_render.core.rng import Stream, random_words, uniform
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.formulas import POLE
 from hesim_render.pixels.evs.model import EvsNoise
-from hesim_render.pixels.evs.noise_spread import most_bandwidth
+from hesim_render.pixels.evs.processes import most_bandwidth
 
 #: Grid of levels, in standard deviations.
 _STEP = 0.1

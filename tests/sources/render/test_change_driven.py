@@ -105,6 +105,7 @@ def test_a_crop_is_the_full_sensor(name):
 
 @pytest.mark.parametrize("reference", ["previous_sample", "last_event"])
 def test_a_run_goes_on_where_another_one_stopped(reference):
+    """With another renderer, which has not seen what came before."""
     changes = NOISE if reference == "previous_sample" else {"evs.threshold_mismatch_rel": 0.02}
     is_tick = reference == "previous_sample"
     sensor = hr.load_sensor("reference-mono" if is_tick else "davis346", changes).crop(
@@ -114,17 +115,23 @@ def test_a_run_goes_on_where_another_one_stopped(reference):
     keys = [{"t_us": 0, "rotation_deg": 0}, {"t_us": 200_000, "rotation_deg": -360}]
     scene = hr.load_scene("rotating-star", {"motion": [{"object": "target", "keyframes": keys}]})
 
-    def run(begin_us, end_us, pixels=None):
+    def new_run():
         source = ChangeDrivenFlux(scene, sensor, seed=4)
-        capture = Capture(source, source.sensor, *noise_models(sensor), end_us, 5, begin_us=begin_us, pixels=pixels)
-        parts = [item for item in capture.run() if isinstance(item, np.ndarray)]
-        return np.concatenate(parts), capture.pixel_state
+        return Capture(source, source.sensor, *noise_models(sensor), 2 * half_us, 5)
 
-    whole, _ = run(0, 2 * half_us)
-    first, state = run(0, half_us)
-    second, _ = run(half_us, 2 * half_us, state)
-    assert first.size > 20 and second.size > 20
-    np.testing.assert_array_equal(np.sort(np.concatenate([first, second])), np.sort(whole))
+    def events_of(items):
+        return np.concatenate([item for item in items if isinstance(item, np.ndarray)])
+
+    whole, begun, first = events_of(new_run().run()), new_run(), []
+    for item in begun.run():
+        first.append(item)
+        if begun.progress[0] >= half_us:
+            break
+    second = new_run()
+    second.go_on(begun.state())
+    parts = events_of(first), events_of(second.run())
+    assert parts[0].size > 20 and parts[1].size > 20 and parts[0]["t_us"].max() <= half_us + 1000
+    np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.sort(whole))
 
 
 def test_instants_are_the_same_however_long_the_run():
