@@ -155,6 +155,22 @@ def test_likelihood_of_counts_is_the_mean_over_normal_thresholds():
     np.testing.assert_allclose(mixture.log_likelihood(m, scale), wanted, atol=2e-5)
 
 
+@pytest.mark.parametrize("pixels", [199, 200])
+def test_the_spread_of_thresholds_is_sought_in_two_hundred_counts(pixels, monkeypatch):
+    """Counts of pixels of normal thresholds, of a spread of 0.35, give it back; of fewer nothing is said."""
+    rng, m, trials = np.random.default_rng(3), 0.35, 400
+    u = np.linspace(1.2, 1.6, pixels)
+    events = rng.binomial(trials, norm.sf(u * (1 + m * rng.standard_normal(pixels)))) + 0.0
+    mixture = dispersion._Mixture(u, events, np.zeros(pixels, np.intp), np.arange(pixels), trials)
+    monkeypatch.setattr(dispersion._Mixture, "of", lambda *_: mixture)
+    spread = dispersion.static_mismatch(None, SimpleNamespace(spread=0.1))
+    if pixels < 200:
+        assert spread.value == 0 and np.isnan(spread.error)
+    else:
+        assert spread.value == pytest.approx(m, abs=4 * m / np.sqrt(2 * pixels))
+        assert 1 < spread.error / (m / np.sqrt(2 * pixels)) < 1.5  # counting adds to it
+
+
 def test_dispersion_weighs_counts_by_what_their_variance_is_known_with():
     """Weights 1/(2 + 1/c) of the squares over counting, less thresholds; the error is that of the weighted mean."""
     rng = np.random.default_rng(1)
