@@ -27,6 +27,7 @@ LEAVES = {"type": "dead-leaves", "width_m": 0.256, "radius_min_m": 0.002, "texel
 TABLE = {"type": "table", "value": [3.0, 4.0]}
 PSF = {"type": "measured", "sample_um": 0.7, "image_height_mm": [0.0], "kernels": [[[0.0, 0.5, 0.5009]]]}
 CORNER = {"cutoff_hz": 70.0, "min_cutoff_hz": 70.0, "signal_dn": 3.0, "follows_light": True}
+FIRM = {"cutoff_hz": 70.0, "follows_light": False}
 DIM, LIT = {"rate_hz": 3.1, "lux": 0.5}, {"rate_hz": 1.7, "lux": 200.0}
 SLOW, QUICK = {"lux": 5.0, "latency_us": 900.0}, {"lux": 1000.0, "latency_us": 70.0}
 SHEET = {"threshold_on_percent": 20.0, "threshold_off_percent": 25.0, "leak_hz": 1.69, "noise_cutoff_hz": 300.0}
@@ -80,6 +81,12 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
     (MeasuredPsf, PSF, {"kernels": [[[0.25, 0.25, 0.25, 0.25]]]}),
     (MeasuredPsf, PSF | {"kernels": [[[1.0] + [0.0] * 256]]}, {"kernels": [[[1.0] + [0.0] * 258]]}),
     (PhotoreceptorSpec, CORNER, {"min_cutoff_hz": 70.1}),
+    (PhotoreceptorSpec, CORNER, {"min_cutoff_hz": None}),
+    (PhotoreceptorSpec, CORNER, {"signal_dn": None}),
+    (PhotoreceptorSpec, FIRM, {"signal_dn": 3.0}),
+    (PhotoreceptorSpec, FIRM, {"min_cutoff_hz": 60.0}),
+    (PhotoreceptorSpec, FIRM, {"filters_noise": True}),
+    (PhotoreceptorSpec, FIRM, {"approach": "gradual"}),
     (TrackSpec, {"object": "a", "keyframes": [{"t_us": 0}, {"t_us": 1}]}, {"keyframes": [{"t_us": 1}, {"t_us": 1}]}),
     (DataSheetSpec, TWO, {"leak_hz": 1.7}),
     (DataSheetSpec, TWO, {"dark_lux": 0.3}),
