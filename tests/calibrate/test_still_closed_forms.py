@@ -451,12 +451,12 @@ def test_a_target_whose_cycles_do_not_show_tells_no_thresholds():
         group=np.arange(count.shape[1]),
         used=np.ones(count.shape[1], np.bool_),
     )
-    found = target.thresholds(tally, 2.0, None)
+    found = target.thresholds(tally, 2.0, None, 0.0)
     assert "no steady period is seen" in found.ratio["reason"]
-    few = target.thresholds(tally, 2.0, 0.9)
+    few = target.thresholds(tally, 2.0, 0.9, 0.0)
     assert "a pixel sees 2.7 cycles of the target, with 14.8 events" in few.entries["theta_on"]["reason"]
     count[:, 2 * target.GROUPS - 1 :] = 0
-    assert f"{2 * target.GROUPS} are needed" in target.thresholds(tally, 2.0, 5.0).ratio["reason"]
+    assert f"{2 * target.GROUPS} are needed" in target.thresholds(tally, 2.0, 5.0, 0.0).ratio["reason"]
 
 
 @pytest.mark.parametrize(("hz", "events", "enough"), [(1.0, 4.5, True), (0.99, 4.5, False), (1.0, 4.4, False)])
@@ -469,7 +469,7 @@ def test_three_cycles_of_one_and_a_half_events_are_enough(hz, events, enough, mo
         group=np.arange(count.shape[1]) // 4,
         used=np.ones(count.shape[1], np.bool_),
     )
-    told = target.thresholds(tally, 2.0, hz)
+    told = target.thresholds(tally, 2.0, hz, 0.0)
     assert ("3 cycles of 1.5 events are needed" in str(told)) is not enough
 
 
