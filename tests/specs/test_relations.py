@@ -18,8 +18,8 @@ from hesim_render.specs.lens import IlluminationTable, MeasuredPsf
 from hesim_render.specs.light import LightSpec, TableWaveformSpec
 from hesim_render.specs.mitsuba_scene import MitsubaSpec
 from hesim_render.specs.motion import DeformationSpec, KeyframeSpec, TrackSpec
-from hesim_render.specs.scene import CameraSpec, ObjectSpec
-from hesim_render.specs.spectrum import DyeSpec
+from hesim_render.specs.scene import CameraSpec, ObjectSpec, SceneSpec
+from hesim_render.specs.spectrum import DyeSpec, SpectrumSpec
 from hesim_render.specs.study import SurfacesSpec
 from hesim_render.specs.sweep import RangeSpec
 
@@ -54,6 +54,15 @@ def pose(last=1.00009, stretch=1.00004, shear=9e-5, mirror=1):
     return [[0, -1, 0, 0.3], [stretch, shear, 0, -0.2], [0, 0, mirror, 4.0], [0, 0, 0, last]]
 
 
+ABOUT = {"schema_version": 1, "name": "a", "description": ""}
+CARD = {"name": "b", "shape": "rectangle"}
+SCENE = ABOUT | {
+    "objects": [CARD],
+    "light": {"type": "uniform", "illuminance_lux": 3.0},
+    "camera": {"horizontal_fov_deg": 30.0},
+}
+TRACK = {"object": "b", "keyframes": [{"t_us": 0}, {"t_us": 7}]}
+DARK = {"type": "none"}
 POSE = {"t_us": 3, "matrix": pose()}
 OTHER_POSE = {"t_us": 3, "matrix": pose(last=0.99991, stretch=0.99996, shear=-9e-5)}
 RELATIONS = [  # model, keys that are right, what makes them wrong
@@ -140,6 +149,7 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
     (LightSpec, POINT, {"rotation_deg": 10.0}),
     (LightSpec, POINT, {"irradiance_w_m2": 3.0}),
     (LightSpec, POINT, {"illuminance_lux": None}),
+    (LightSpec, POINT | {"plane_normal": [0, 0, 1.1e-9]}, {"plane_normal": [0, 0, 0.9e-9]}),
     (LightSpec, {"type": "none"}, {"illuminance_lux": 3.0}),
     (LightSpec, {"type": "none"}, {"waveform": {"type": "mains", "frequency_hz": 50, "depth": 0.4}}),
     (MitsubaSpec, BOX, {"inline": {"a": {"type": "constant"}}}),
@@ -149,6 +159,21 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
     (MitsubaSpec, BOX | LEVEL, {"radiance_scale": 2.0}),
     (MitsubaSpec, BOX | LEVEL, {"plane_normal": None}),
     (MitsubaSpec, BOX, {"plane_point_m": [0, 0, 1]}),
+    (SceneSpec, SCENE | {"motion": [TRACK]}, {"motion": [TRACK, TRACK]}),
+    (SceneSpec, SCENE, {"objects": []}),
+    (SceneSpec, SCENE, {"objects": [CARD, CARD]}),
+    (SceneSpec, SCENE, {"objects": [CARD | {"name": "target"}]}),
+    (SceneSpec, SCENE, {"objects": [CARD | {"name": "camera"}]}),
+    (SceneSpec, SCENE, {"camera": None}),
+    (SceneSpec, SCENE, {"camera": {"fit": "target"}}),
+    (SceneSpec, ABOUT | {"mitsuba": BOX, "light": DARK}, {"light": POINT}),
+    (SceneSpec, ABOUT | {"mitsuba": BOX}, {"objects": [CARD]}),
+    (SceneSpec, ABOUT | {"mitsuba": BOX, "camera": {}}, {"camera": {"fit": "target"}}),
+    (SpectrumSpec, {"colorchecker": "cc_ohta", "patch": 24}, {"patch": None}),
+    (SpectrumSpec, {"colorchecker": "cc_ohta", "patch": 24}, {"patch": 25}),
+    (SpectrumSpec, {"colorchecker": "cc_ohta", "patch": 1}, {"patch": 0}),
+    (SpectrumSpec, {"peak_nm": 500.0, "fwhm_nm": 30.0}, {"fwhm_nm": None}),
+    (SpectrumSpec, {"peak_nm": 500.0, "fwhm_nm": 30.0}, {"flat": 0.3}),
     (KeyframeSpec, POSE, {"matrix": pose(last=1.0002)}),
     (KeyframeSpec, POSE, {"matrix": pose(stretch=1.0002)}),
     (KeyframeSpec, POSE, {"matrix": pose(shear=2e-4)}),
