@@ -197,6 +197,14 @@ def test_a_bend_of_the_variance_is_told_in_parts_of_the_brightest():
     assert told.p_value == pytest.approx(2 * norm.sf(6), rel=1e-6, abs=0)
     assert frame_checks._curvature(of_frames(cubic=(-3e-8, 1e-8))) is None  # three errors
     assert frame_checks._curvature(of_frames()) is None
+    # of two positions the one that is more errors off is named; χ² of two degrees of freedom is exponential
+    one, two = of_frames(cubic=(1e-8, 1e-8)), of_frames(cubic=(-3e-8, 5e-9))
+    both = SimpleNamespace(
+        bins={(0, 0): one.bins[0, 1], (1, 0): two.bins[0, 1]}, fits={(0, 0): one.fits[0, 1], (1, 0): two.fits[0, 1]}
+    )
+    told = frame_checks._curvature(both)
+    assert "at position (1, 0) a term in I³ is -3e-08" in told.text
+    assert told.p_value == pytest.approx(np.exp(-37 / 2), rel=1e-6, abs=0)
 
 
 def test_dark_current_is_the_mean_of_good_pixels():
