@@ -1,5 +1,6 @@
 """Laws that calibrations of event pixels fit: by SciPy, slopes by finite differences, means by quadrature."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.stats import multivariate_normal, norm
 from hesim_render.calibrate.asynchronous import analysis as trials_analysis
 from hesim_render.calibrate.asynchronous import fit as trials_fit
 from hesim_render.calibrate.asynchronous import likelihood
-from hesim_render.calibrate.evs import analysis, dispersion, thresholds
+from hesim_render.calibrate.evs import analysis, defects, dispersion, thresholds
 from hesim_render.calibrate.evs import fit as events_fit
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_probability
@@ -169,6 +170,22 @@ def test_the_spread_of_thresholds_is_sought_in_two_hundred_counts(pixels, monkey
     else:
         assert spread.value == pytest.approx(m, abs=4 * m / np.sqrt(2 * pixels))
         assert 1 < spread.error / (m / np.sqrt(2 * pixels)) < 1.5  # counting adds to it
+
+
+@pytest.mark.parametrize("reach", [0.34, 1.2])
+def test_counts_are_out_of_reach_where_no_threshold_near_gives_them_in_1e_7(reach):
+    """Of 300 comparisons, the sum over all counts that are as far off; beyond a reach of 1 the threshold is 0."""
+    trials, u = 300, np.array([0.9, 1.7])
+
+    def chances(p):
+        return np.array([math.comb(trials, k) * p**k * (1 - p) ** (trials - k) for k in range(trials + 1)])
+
+    for number, typical in enumerate(u):
+        group = np.full(trials + 1, number)
+        found = defects._out_of_reach(np.arange(trials + 1), group, trials, u, reach)
+        as_many = chances(norm.sf(typical * max(1 - reach, 0)))[::-1].cumsum()[::-1]
+        as_few = chances(norm.sf(typical * (1 + reach))).cumsum()
+        np.testing.assert_array_equal(found, np.minimum(as_many, as_few) < 1e-7)
 
 
 def test_dispersion_weighs_counts_by_what_their_variance_is_known_with():
