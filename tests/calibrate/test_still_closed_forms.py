@@ -689,3 +689,33 @@ def test_files_are_read_in_equal_parts_of_the_progress(monkeypatch):
         ["a", "b"], lux=[3.0, 8.0], target_file="c", target_contrast=4.0, progress=lambda what, part: parts.append(part)
     )
     assert found == (["a", "b"], "c") and parts == pytest.approx([0, 0.25, 0.5, 0.75])
+
+
+@pytest.mark.parametrize("seed", [5, 12, 14, 18, 24])
+def test_the_step_of_a_density_is_where_two_poisson_laws_are_likeliest(seed):
+    """Counts of each µs, before d and from d to 2 d: the gain in likelihood over one law. Then all places up to 2 d of
+    the best, with half an event more in each rate.
+    """
+    rng = np.random.default_rng(seed)
+    counts = rng.poisson(np.where(np.arange(60) < rng.integers(3, 9), rng.uniform(20, 80), 45)).astype(np.float64)
+
+    def log(some, rate):
+        return stats.poisson.logpmf(some, rate).sum()
+
+    gains = {}
+    for d in range(1, 30):
+        below, upper = counts[:d], counts[d : 2 * d + 1]
+        if upper.sum() >= 100 and upper.mean() > below.mean():
+            both = counts[: 2 * d + 1]
+            gains[d] = log(below, below.mean()) + log(upper, upper.mean()) - log(both, both.mean())
+    best = max(gains, key=gains.get)
+    places, inside = np.arange(1, 2 * best + 1), counts[: 2 * best + 1]
+    own = [
+        log(part, (part.sum() + 0.5) / part.size) + log(rest, (rest.sum() + 0.5) / rest.size)
+        for part, rest in ((inside[:d], inside[d:]) for d in places)
+    ]
+    place, chance = short_intervals._step(counts)
+    assert place.tolist() == places.tolist()
+    np.testing.assert_allclose(
+        chance, np.exp(own - np.max(own)) / np.exp(own - np.max(own)).sum(), rtol=1e-6, atol=1e-12
+    )
