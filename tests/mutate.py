@@ -365,6 +365,42 @@ FIXED = (
         '((some["t_us"] - begin) / (interval_us + 1))',
         ("tests/events/test_event_arrays.py",),
     ),
+    Fixed(
+        "frames that scatter: the least likely position is named, not the likeliest",
+        "worst = min(wide, key=lambda p: wide[p].p_value)",
+        "worst = max(wide, key=lambda p: wide[p].p_value)",
+        (_FORMS,),
+    ),
+    Fixed(
+        "spread of thresholds: sought in however few counts",
+        "if mixture.pixel.size < _FEWEST_COUNTS:",
+        "if mixture.pixel.size < 0:",
+        ("tests/calibrate/test_event_closed_forms.py",),
+    ),
+    Fixed(
+        "simulated bench: the end of the light is stored in place of the events",
+        'cycles)[0], "rapid")',
+        'cycles)[1], "rapid")',
+        ("tests/report/test_instrument.py",),
+    ),
+    Fixed(
+        "EMVA frames: at the left of 16 bits if one pixel has no bit below",
+        "not np.any(frame & low)",
+        "not np.all(frame & low)",
+        ("tests/calibrate/test_pairs_closed_forms.py",),
+    ),
+    Fixed(
+        "flicker: the error of one light replaces that of its other pieces",
+        "total += np.float32(weight) * error",
+        "total[:] = np.float32(weight) * error",
+        ("tests/sources/test_flicker.py",),
+    ),
+    Fixed(
+        "curves of a sensor: a dead time of 1 µs where it has none",
+        "(self.noise.refractory_period_us or 0) * S_PER_US\n        bandwidth_hz",
+        "(self.noise.refractory_period_us or 1) * S_PER_US\n        bandwidth_hz",
+        ("tests/describe/test_curves.py",),
+    ),
 )
 
 

@@ -125,7 +125,7 @@ def report_beginning(calibration: str | Path) -> str:
     return _REPORT + hashlib.sha256(os.fsencode(Path(calibration).expanduser().resolve())).hexdigest()[:16]
 
 
-def check_report(calibration: str | Path, report: str | Path, overwrite: bool = False) -> Path:
+def check_report(calibration: str | Path, report: str | Path, overwrite: bool) -> Path:
     """Whether a report may be written; returns its absolute path.
 
     The report of this very calibration is brought up to date without being asked; that of another one only with

@@ -39,7 +39,7 @@ def read_yaml(file: Path, with_lines: bool = True) -> Any:
     return parse_yaml(WholeFile(file, _MOST_BYTES).text(), file, with_lines)
 
 
-def parse_yaml(text: str, file: Path, with_lines: bool = True) -> Any:
+def parse_yaml(text: str, file: Path, with_lines: bool) -> Any:
     """The mapping in a text; see `read_yaml`. `file` is for errors."""
     with reading(file, "as YAML"):
         try:

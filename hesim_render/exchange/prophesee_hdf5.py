@@ -215,7 +215,6 @@ def read_triggers(path: Path) -> NDArray:
         if _is_packed(stored) or stored.shape[0] > MOST_TRIGGERS:
             problem = f"{TRIGGERS} is packed with ECF, or has more than {MOST_TRIGGERS} edges"
             raise SpecError(problem, file=path)
-        _chunk_of(stored)
         rows = stored[:]
     if rows.size and not 0 <= rows["id"].min() <= rows["id"].max() < 256:
         raise SpecError(f"{TRIGGERS} names a line that is none; expected 0 to 255", file=path)

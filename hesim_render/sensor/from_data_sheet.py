@@ -84,7 +84,7 @@ class Figures:
     own_hz: float = 0.0
 
     @classmethod
-    def of_data_sheet(cls, sheet: DataSheetSpec, own_hz: float = 0.0) -> Figures:
+    def of_data_sheet(cls, sheet: DataSheetSpec, own_hz: float) -> Figures:
         """Figures of a data sheet. A latency is that of an ON event; the corner is that of the light after the step."""
         for stated in sheet.background:
             if stated.rate_hz <= sheet.leak_hz + own_hz:

@@ -92,7 +92,7 @@ class PhotoreceptorSpec(Strict):
             raise ValueError("approach 'gradual' needs follows_light; a corner that is the same in any light has none")
         return self
 
-    def series_hz(self, limit_hz: float = 0.0) -> float | None:
+    def series_hz(self, limit_hz: float) -> float | None:
         """Corner in series with that of the light, Hz; None where the approach is abrupt.
 
         Parameters

@@ -47,7 +47,7 @@ from hesim_render.studies.colour_noise import (
 from hesim_render.studies.table import Cell
 
 
-def white_rate(responses: Sequence[Spectrum], light: Spectrum, lux: float = 1.0) -> NDArray[np.float64]:
+def white_rate(responses: Sequence[Spectrum], light: Spectrum, lux: float) -> NDArray[np.float64]:
     """Electrons per second of one pixel of each channel on a perfect diffuser, ∫ R(λ) E(λ)/π dλ, [channel].
 
     Parameters

@@ -379,6 +379,10 @@ def test_a_scheduler_that_dies_and_a_clip_that_kills_its_workers_are_told(monkey
     closed.status = "closed"
     with pytest.raises(BackendError, match="the finished ones stay"):
         run_on_cluster(closed, "{}", clips[:1], told.append)
+    told.clear()
+    with pytest.raises(ModuleNotFoundError, match="hesim_render"):  # of a worker of another environment
+        run_on_cluster(Client(None, ModuleNotFoundError("hesim_render")), "{}", clips[:2], told.append)
+    assert [answer["name"] for answer in told] == [clips[0].name]
 
 
 @pytest.mark.slow

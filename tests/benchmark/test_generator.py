@@ -244,6 +244,8 @@ def test_shares_give_each_item_to_one_split():
     assert [len(part) for part in found] == [14, 3, 3]
     assert [len(part) for part in shares(range(3), [0.7, 0.15, 0.15], "k")] == [1, 1, 1]
     assert [len(part) for part in shares(range(5), [1.0, 0.0, 0.0], "k")] == [5, 0, 0]
+    # what is left over goes to the largest remainders: of 13.8, 5.75 and 3.45
+    assert [len(part) for part in shares(range(23), [0.6, 0.25, 0.15], "k")] == [14, 6, 3]
     assert shares(range(20), [0.5, 0.5], "a") != shares(range(20), [0.5, 0.5], "b")
 
 

@@ -132,6 +132,14 @@ def test_variances_scatter_too_much_from_a_twentieth_on(chi2, chance, seen):
         assert "χ²/dof 2.102 at position (1, 0)" in told.text and told.p_value == pytest.approx(4e-30, rel=1e-6, abs=0)
 
 
+def test_of_several_positions_that_scatter_the_least_likely_is_named():
+    """Not the one of the largest χ²: its count of pixels may be small."""
+    chances = {(0, 0): (2.9, 1e-12), (0, 1): (2.2, 1e-30), (1, 1): (2.5, 1e-20), (1, 2): (2.0, 0.3)}
+    fits = {p: SimpleNamespace(chi2_per_dof=c, expected_chi2=2.0, p_value=v) for p, (c, v) in chances.items()}
+    told = frame_checks._scatter(SimpleNamespace(fits=fits))
+    assert "2.200 at position (0, 1)" in told.text and told.p_value == pytest.approx(4e-30, rel=1e-6, abs=0)
+
+
 def of_frames(cubic=None):
     """A calibration with a dark variance of 4 − 1/12 DN², and known errors of β0 and β3."""
     bins = SimpleNamespace(
@@ -189,6 +197,14 @@ def test_a_bend_of_the_variance_is_told_in_parts_of_the_brightest():
     assert told.p_value == pytest.approx(2 * norm.sf(6), rel=1e-6, abs=0)
     assert frame_checks._curvature(of_frames(cubic=(-3e-8, 1e-8))) is None  # three errors
     assert frame_checks._curvature(of_frames()) is None
+    # of two positions the one that is more errors off is named; χ² of two degrees of freedom is exponential
+    one, two = of_frames(cubic=(1e-8, 1e-8)), of_frames(cubic=(-3e-8, 5e-9))
+    both = SimpleNamespace(
+        bins={(0, 0): one.bins[0, 1], (1, 0): two.bins[0, 1]}, fits={(0, 0): one.fits[0, 1], (1, 0): two.fits[0, 1]}
+    )
+    told = frame_checks._curvature(both)
+    assert "at position (1, 0) a term in I³ is -3e-08" in told.text
+    assert told.p_value == pytest.approx(np.exp(-37 / 2), rel=1e-6, abs=0)
 
 
 def test_dark_current_is_the_mean_of_good_pixels():

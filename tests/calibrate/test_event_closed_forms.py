@@ -1,5 +1,6 @@
 """Laws that calibrations of event pixels fit: by SciPy, slopes by finite differences, means by quadrature."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.stats import multivariate_normal, norm
 from hesim_render.calibrate.asynchronous import analysis as trials_analysis
 from hesim_render.calibrate.asynchronous import fit as trials_fit
 from hesim_render.calibrate.asynchronous import likelihood
-from hesim_render.calibrate.evs import dispersion, thresholds
+from hesim_render.calibrate.evs import analysis, defects, dispersion, thresholds
 from hesim_render.calibrate.evs import fit as events_fit
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_probability
@@ -153,6 +154,38 @@ def test_likelihood_of_counts_is_the_mean_over_normal_thresholds():
     top = terms.max(axis=1)
     wanted = top + np.log(np.exp(terms - top[:, None]).sum(axis=1) * (z[1] - z[0])) - 0.5 * np.log(2)
     np.testing.assert_allclose(mixture.log_likelihood(m, scale), wanted, atol=2e-5)
+
+
+@pytest.mark.parametrize("pixels", [199, 200])
+def test_the_spread_of_thresholds_is_sought_in_two_hundred_counts(pixels, monkeypatch):
+    """Counts of pixels of normal thresholds, of a spread of 0.35, give it back; of fewer nothing is said."""
+    rng, m, trials = np.random.default_rng(3), 0.35, 400
+    u = np.linspace(1.2, 1.6, pixels)
+    events = rng.binomial(trials, norm.sf(u * (1 + m * rng.standard_normal(pixels)))) + 0.0
+    mixture = dispersion._Mixture(u, events, np.zeros(pixels, np.intp), np.arange(pixels), trials)
+    monkeypatch.setattr(dispersion._Mixture, "of", lambda *_: mixture)
+    spread = dispersion.static_mismatch(None, SimpleNamespace(spread=0.1))
+    if pixels < 200:
+        assert spread.value == 0 and np.isnan(spread.error)
+    else:
+        assert spread.value == pytest.approx(m, abs=4 * m / np.sqrt(2 * pixels))
+        assert 1 < spread.error / (m / np.sqrt(2 * pixels)) < 1.5  # counting adds to it
+
+
+@pytest.mark.parametrize("reach", [0.34, 1.2])
+def test_counts_are_out_of_reach_where_no_threshold_near_gives_them_in_1e_7(reach):
+    """Of 300 comparisons, the sum over all counts that are as far off; beyond a reach of 1 the threshold is 0."""
+    trials, u = 300, np.array([0.9, 1.7])
+
+    def chances(p):
+        return np.array([math.comb(trials, k) * p**k * (1 - p) ** (trials - k) for k in range(trials + 1)])
+
+    for number, typical in enumerate(u):
+        group = np.full(trials + 1, number)
+        found = defects._out_of_reach(np.arange(trials + 1), group, trials, u, reach)
+        as_many = chances(norm.sf(typical * max(1 - reach, 0)))[::-1].cumsum()[::-1]
+        as_few = chances(norm.sf(typical * (1 + reach))).cumsum()
+        np.testing.assert_array_equal(found, np.minimum(as_many, as_few) < 1e-7)
 
 
 def test_dispersion_weighs_counts_by_what_their_variance_is_known_with():

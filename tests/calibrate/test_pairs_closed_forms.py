@@ -14,7 +14,8 @@ from hesim_render.calibrate.aps import light_curve, noise_spectrum, pair_levels,
 from hesim_render.calibrate.aps.light_curve import require_steady_light
 from hesim_render.calibrate.aps.pair_levels import Levels, SpatialStack, pair_statistics
 from hesim_render.core.errors import SpecError
-from hesim_render.recording.pair_set import Series
+from hesim_render.recording import pair_set
+from hesim_render.recording.pair_set import PairSet, Series
 
 X = np.array([1.0, 2.5, 4.0, 7.0, 11.0])
 
@@ -419,3 +420,21 @@ def test_noise_told_by_grey_values_joins_the_fit_as_a_measurement(monkeypatch):
         found.beta, covariance @ (known @ fit.beta + line * (0.61**2 - 0.03) / own), rtol=1e-5, atol=1e-9
     )
     assert pairs._with_dark_noise(SimpleNamespace(fit=fit, rounded_noise=None)) is fit
+
+
+@pytest.mark.parametrize(
+    ("frame", "bits"),
+    [
+        ([[16, 4080], [16 * 4095, 48]], 4),  # 12 bits at the left of 16
+        ([[16, 4081], [16 * 4095, 48]], 0),  # one pixel that is not: too large for its bits, see the test of mistakes
+        ([[16, 4080], [2048, 48]], 0),  # as large as 12 bits are
+    ],
+)
+def test_values_are_to_the_left_where_no_pixel_has_a_bit_below(frame, bits, monkeypatch):
+    """The ADC's 12 bits lie at either end of 16, and the brightest frame tells at which."""
+    monkeypatch.setattr(pair_set, "read_grey", lambda file, shape: np.array(frame, np.uint16))
+    given = SimpleNamespace(
+        spec=SimpleNamespace(bit_depth=12, full_scale_dn=4095), shape=(1, 1), tile=(2, 2),
+        lit=[SimpleNamespace(files=["a"])],
+    )  # fmt: skip
+    assert PairSet._left_bits.func(given) == bits

@@ -451,12 +451,12 @@ def test_a_target_whose_cycles_do_not_show_tells_no_thresholds():
         group=np.arange(count.shape[1]),
         used=np.ones(count.shape[1], np.bool_),
     )
-    found = target.thresholds(tally, 2.0, None)
+    found = target.thresholds(tally, 2.0, None, 0.0)
     assert "no steady period is seen" in found.ratio["reason"]
-    few = target.thresholds(tally, 2.0, 0.9)
+    few = target.thresholds(tally, 2.0, 0.9, 0.0)
     assert "a pixel sees 2.7 cycles of the target, with 14.8 events" in few.entries["theta_on"]["reason"]
     count[:, 2 * target.GROUPS - 1 :] = 0
-    assert f"{2 * target.GROUPS} are needed" in target.thresholds(tally, 2.0, 5.0).ratio["reason"]
+    assert f"{2 * target.GROUPS} are needed" in target.thresholds(tally, 2.0, 5.0, 0.0).ratio["reason"]
 
 
 @pytest.mark.parametrize(("hz", "events", "enough"), [(1.0, 4.5, True), (0.99, 4.5, False), (1.0, 4.4, False)])
@@ -469,7 +469,7 @@ def test_three_cycles_of_one_and_a_half_events_are_enough(hz, events, enough, mo
         group=np.arange(count.shape[1]) // 4,
         used=np.ones(count.shape[1], np.bool_),
     )
-    told = target.thresholds(tally, 2.0, hz)
+    told = target.thresholds(tally, 2.0, hz, 0.0)
     assert ("3 cycles of 1.5 events are needed" in str(told)) is not enough
 
 
@@ -689,3 +689,33 @@ def test_files_are_read_in_equal_parts_of_the_progress(monkeypatch):
         ["a", "b"], lux=[3.0, 8.0], target_file="c", target_contrast=4.0, progress=lambda what, part: parts.append(part)
     )
     assert found == (["a", "b"], "c") and parts == pytest.approx([0, 0.25, 0.5, 0.75])
+
+
+@pytest.mark.parametrize("seed", [5, 12, 14, 18, 24])
+def test_the_step_of_a_density_is_where_two_poisson_laws_are_likeliest(seed):
+    """Counts of each µs, before d and from d to 2 d: the gain in likelihood over one law. Then all places up to 2 d of
+    the best, with half an event more in each rate.
+    """
+    rng = np.random.default_rng(seed)
+    counts = rng.poisson(np.where(np.arange(60) < rng.integers(3, 9), rng.uniform(20, 80), 45)).astype(np.float64)
+
+    def log(some, rate):
+        return stats.poisson.logpmf(some, rate).sum()
+
+    gains = {}
+    for d in range(1, 30):
+        below, upper = counts[:d], counts[d : 2 * d + 1]
+        if upper.sum() >= 100 and upper.mean() > below.mean():
+            both = counts[: 2 * d + 1]
+            gains[d] = log(below, below.mean()) + log(upper, upper.mean()) - log(both, both.mean())
+    best = max(gains, key=gains.get)
+    places, inside = np.arange(1, 2 * best + 1), counts[: 2 * best + 1]
+    own = [
+        log(part, (part.sum() + 0.5) / part.size) + log(rest, (rest.sum() + 0.5) / rest.size)
+        for part, rest in ((inside[:d], inside[d:]) for d in places)
+    ]
+    place, chance = short_intervals._step(counts)
+    assert place.tolist() == places.tolist()
+    np.testing.assert_allclose(
+        chance, np.exp(own - np.max(own)) / np.exp(own - np.max(own)).sum(), rtol=1e-6, atol=1e-12
+    )

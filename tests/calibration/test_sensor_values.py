@@ -76,6 +76,23 @@ def test_values_of_fixed_comparisons(hardware, volts, measured, theta):
     assert found == pytest.approx(thresholds | rest | ({} if hardware is None else {"threshold_hardware_v": hardware}))
 
 
+def test_what_a_calibration_of_events_does_not_know_is_left_out():
+    """Mismatch, leak and asymmetry that have no value are 0; the polarities' thresholds are equal then."""
+    sensor = {
+        "evs": {"reference": "previous_sample", "contrast_threshold_on": 0.2, "contrast_threshold_off": 0.3},
+        "evs_grid": {"rows_per_tile": 1, "cols_per_tile": 1},
+    }
+    evs = SimpleNamespace(
+        theta_hardware_v=None, theta=item(0.24), theta_on=item(None), theta_off=item(0.3), asymmetry=item(None),
+        positions=[position(200.0, 8.0, 0.3, 0.05)], A=item(180.0), B=item(5.0), C=item(0.1), D=item(0.1),
+        threshold_mismatch_rel=item(None), shot_law="sqrt", leak_rate_hz=item(None),
+    )  # fmt: skip
+    for leak in ({}, {"leak_rate_hz": None, "leak_per_trial": item(None)}, {"leak_rate_hz": item(-0.1)}):
+        found = _evs_values(sensor, SimpleNamespace(**{**vars(evs), **leak}), SimpleNamespace(path=FILE))
+        assert found["contrast_threshold_on"] == found["contrast_threshold_off"] == 0.24
+        assert found["threshold_mismatch_rel"] == found["leak_rate_hz"] == 0.0
+
+
 def test_values_of_asynchronous_pixels():
     evs = SimpleNamespace(
         beta=[[9.0, 1.5, 1.0, 0.3, 0.02, 0.4]], theta_on=item(0.21), theta_off=item(0.27),

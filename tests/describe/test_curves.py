@@ -11,7 +11,7 @@ import hesim_render as hr
 from hesim_render.core import drawing
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.describe import event_curves, figures_of, photon_transfer, picture, s_curve, table_lines
+from hesim_render.describe import curves, event_curves, figures_of, photon_transfer, picture, s_curve, table_lines
 from hesim_render.describe.table import TABLE_LUX
 from hesim_render.pixels.evs.noise_rates import events_per_period
 from hesim_render.pixels.evs.stage import EvsStage
@@ -156,6 +156,18 @@ def test_comparator_noise_is_in_the_rates():
     assert curves.sigma[0] < without.sigma[0]
     with pytest.raises(SpecError, match="is not above leak and comparator_noise"):
         hr.load_sensor("davis240", {"evs.comparator_noise": {"off_hz": stated.rate_hz}})
+
+
+@pytest.mark.parametrize("dead_us", [None, 23])
+def test_rates_are_those_of_the_dead_time_and_of_the_leak(dead_us, monkeypatch):
+    """Seconds and Hz; a sensor may have no dead time."""
+    given = []
+    monkeypatch.setattr(curves, "noise_rates_hz", lambda *arguments: given.append(arguments) or (0.7, 0.4))
+    changes = {"evs.refractory_period_us": dead_us, "evs.leak_rate_hz": 0.17, "evs.comparator_noise": {"on_hz": 0.03}}
+    found = event_curves(hr.load_sensor("davis346", changes), [7.0])
+    (*_, dead_s, resets_hz) = given[0]
+    assert dead_s == pytest.approx((dead_us or 0) * 1e-6, abs=0) and resets_hz == pytest.approx(0.2)
+    assert found.on_hz[0] == pytest.approx(0.9) and found.off_hz[0] == pytest.approx(0.4)
 
 
 @pytest.mark.slow

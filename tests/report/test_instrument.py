@@ -19,7 +19,7 @@ from hesim_render.spectral.spectrum import illuminant
 
 
 class Stage:
-    """Notes light and comparisons; its level is ln of the light."""
+    """Notes light and comparisons; its level is ln of the light, and each step gives an event."""
 
     def __init__(self):
         self.seen, self.resets, self.level = [], [], None
@@ -28,7 +28,9 @@ class Stage:
         assert not self.seen or t_us >= self.seen[-1][0]
         self.seen.append((t_us, lux))
         self.level = math.log(lux)
-        return no_events()
+        event = np.zeros(1, no_events().dtype)
+        event["t_us"] = t_us
+        return event
 
     def compare_with(self, level):
         self.resets.append((self.seen[-1][0], level))
@@ -48,10 +50,10 @@ def bench(spec, corner_hz=None):
     made._noise = SimpleNamespace(spec=spec, corner_hz=corner_hz)
     made._seed, made._number, made._per_lux = 3, 0, np.array([2.0, 5.0])
     made._content = {"steps": [], "modulation": []}
-    made.stages, made.files = [], []
+    made.stages, made.files, made.saved = [], [], []
     made._stage = lambda: made.stages.append(Stage()) or made.stages[-1]
     made._electrons = lambda lux: lux
-    made._save = lambda events, name: made.files.append(name) or name
+    made._save = lambda events, name: made.saved.append(events["t_us"].tolist()) or made.files.append(name) or name
     return made
 
 
@@ -95,6 +97,7 @@ def test_steps_rise_and_fall_by_their_size_at_the_times_of_the_file(tick_us):
         assert np.all(np.diff(t_us) == tick_us)
     made._steps(70.0, 0.35, 3)
     assert len({entry["file"] for entry in made._content["steps"]}) == 2 == len(set(made.files))
+    assert made.saved == [[when for when, _ in stage.seen] for stage in made.stages]
 
 
 def test_modulated_light_swings_by_thresholds_at_parts_of_the_corner_frequency():
@@ -125,7 +128,8 @@ def test_bursts_begin_and_end_in_still_light_and_have_the_stated_swing_in_their_
     made = bench(pixels())
     events, end_us, times = made._bursts(40.0, 0.9)
     (stage,) = made.stages
-    assert events.size == 0 and times["length_us"] == 5 * 25_000 and times["begin_us"] == made._half_us(REFERENCE_LUX)
+    assert events["t_us"].tolist() == [when for when, _ in stage.seen]
+    assert times["length_us"] == 5 * 25_000 and times["begin_us"] == made._half_us(REFERENCE_LUX)
     assert times["period_us"] == times["length_us"] + times["begin_us"]
     assert end_us == times["begin_us"] + 2 * times["period_us"] == stage.seen[-1][0]
     t_us, lux = np.array(stage.seen).T
@@ -162,12 +166,12 @@ def test_busy_and_rapid_light():
     np.testing.assert_allclose(jumps[jumps != 0], 12 * 0.27 * np.resize([1, -1], 20))
     half = made._half_us(REFERENCE_LUX)
     assert t_us[1:][jumps != 0].tolist() == (half * np.arange(1, 21) + 1).tolist() and t_us[-1] == 21 * half
-    assert lux[0] == lux[-1] == REFERENCE_LUX
+    assert lux[0] == lux[-1] == REFERENCE_LUX and made.saved == [t_us.tolist()]
     for dead_us, cycles in ((None, 20), (1500, 27)):  # 20 · 1.5 ms · 230 Hz = 6.9 cycles
         made = bench(pixels(refractory_period_us=dead_us))
         made._rapid(0.27)
         t_us, lux = np.array(made.stages[0].seen).T
-        assert t_us[-1] == round(cycles * 1e6 / 230)
+        assert t_us[-1] == round(cycles * 1e6 / 230) and made.saved == [t_us.tolist()]
         assert lux.max() / REFERENCE_LUX - 1 == pytest.approx(math.tanh(15 * 0.27), rel=2e-3)
 
 

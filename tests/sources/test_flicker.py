@@ -440,3 +440,22 @@ def test_windows_that_straddle_slices_have_the_mean_of_their_parts():
     found = [(one.half_a, one.half_b) for one in Sliced().flux_of_blocks(np.arange(2), [block])]
     means = [(30 * 5 + 60 * 7 + 20 * 11) / 110, 9.0, 7.0]
     np.testing.assert_allclose(found, [(mean, 2 * mean) for mean in means])
+
+
+@pytest.mark.parametrize("has_error", [True, False])
+def test_errors_of_pieces_add_and_those_of_lights_are_independent(has_error):
+    """Two lights in three pieces of a window, with weights: √(Σ (Σ w σ)²), as the pieces share their random numbers."""
+    rng = np.random.default_rng(5)
+    weights, error = rng.uniform(0.2, 3, (3, 2)), rng.uniform(1, 9, (3, 2, 4)).astype(np.float32)
+    a, b = rng.uniform(10, 90, (2, 3, 2, 4))
+    samples = [
+        tuple(
+            Sample(jit().Float(a[p, k]), jit().Float(b[p, k]), error[p, k] if has_error else None) for k in range(2)
+        )
+        for p in range(3)
+    ]  # fmt: skip
+    total = FlickerFlux([None, None], [Formula(), Formula(slope_per_s=3.0)])._sum(samples, weights)
+    np.testing.assert_allclose(total.half_a, np.einsum("pk,pkn->n", weights, a), rtol=1e-6)
+    np.testing.assert_allclose(total.half_b, np.einsum("pk,pkn->n", weights, b), rtol=1e-6)
+    wanted = np.hypot(*np.einsum("pk,pkn->kn", weights, error)) if has_error else []
+    np.testing.assert_allclose(total.error, wanted, rtol=1e-6)

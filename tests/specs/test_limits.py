@@ -19,7 +19,7 @@ from hesim_render.specs.files import Strict
 KEYS = Path(__file__).parents[1] / "data" / "keys.txt"
 SIGNS = {
     "gt": ">", "ge": ">=", "lt": "<", "le": "<=",
-    "min_length": "items >=", "max_length": "items <=", "pattern": "~",
+    "min_length": "items >=", "max_length": "items <=", "pattern": "~", "multiple_of": "multiple of",
 }  # fmt: skip
 
 

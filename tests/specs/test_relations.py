@@ -6,8 +6,9 @@ from pydantic import ValidationError
 from hesim_render.core.errors import SpecError
 from hesim_render.sensor.reading import read_sensor
 from hesim_render.sources.video.options import VideoOptions
-from hesim_render.specs.benchmark import NoiseLevel, SharpSpec, SplitShares
+from hesim_render.specs.benchmark import BenchmarkSpec, MaterialShares, NoiseLevel, SharpSpec, SplitShares
 from hesim_render.specs.boards import CharucoTarget, CircleGridTarget, LedGridTarget
+from hesim_render.specs.capture import CaptureSpec
 from hesim_render.specs.charts import DeadLeavesTarget, GreyRampTarget, IntegratingSphereTarget, StepWedgeTarget
 from hesim_render.specs.data_sheet import DataSheetSpec, SpeedSpec
 from hesim_render.specs.event_bench import Modulation, Steady
@@ -17,7 +18,8 @@ from hesim_render.specs.lens import IlluminationTable, MeasuredPsf
 from hesim_render.specs.light import LightSpec, TableWaveformSpec
 from hesim_render.specs.mitsuba_scene import MitsubaSpec
 from hesim_render.specs.motion import DeformationSpec, KeyframeSpec, TrackSpec
-from hesim_render.specs.scene import CameraSpec, ObjectSpec
+from hesim_render.specs.scene import CameraSpec, ObjectSpec, SceneSpec
+from hesim_render.specs.spectrum import DyeSpec, SpectrumSpec
 from hesim_render.specs.study import SurfacesSpec
 from hesim_render.specs.sweep import RangeSpec
 
@@ -27,6 +29,16 @@ LEAVES = {"type": "dead-leaves", "width_m": 0.256, "radius_min_m": 0.002, "texel
 TABLE = {"type": "table", "value": [3.0, 4.0]}
 PSF = {"type": "measured", "sample_um": 0.7, "image_height_mm": [0.0], "kernels": [[[0.0, 0.5, 0.5009]]]}
 CORNER = {"cutoff_hz": 70.0, "min_cutoff_hz": 70.0, "signal_dn": 3.0, "follows_light": True}
+SMALL = {
+    "schema_version": 1,
+    "name": "a",
+    "description": "",
+    "scenes": {"count": 1000},
+    "sensors": [{"sensor": "eiger"}],
+}
+NO_MATERIAL = dict.fromkeys(("diffuse", "plastic", "rough_plastic", "metal"), 0.0)
+CAPTURE = {"bit_depth": 10, "tile_rows": 2, "tile_cols": 4}
+FIRM = {"cutoff_hz": 70.0, "follows_light": False}
 DIM, LIT = {"rate_hz": 3.1, "lux": 0.5}, {"rate_hz": 1.7, "lux": 200.0}
 SLOW, QUICK = {"lux": 5.0, "latency_us": 900.0}, {"lux": 1000.0, "latency_us": 70.0}
 SHEET = {"threshold_on_percent": 20.0, "threshold_off_percent": 25.0, "leak_hz": 1.69, "noise_cutoff_hz": 300.0}
@@ -42,6 +54,15 @@ def pose(last=1.00009, stretch=1.00004, shear=9e-5, mirror=1):
     return [[0, -1, 0, 0.3], [stretch, shear, 0, -0.2], [0, 0, mirror, 4.0], [0, 0, 0, last]]
 
 
+ABOUT = {"schema_version": 1, "name": "a", "description": ""}
+CARD = {"name": "b", "shape": "rectangle"}
+SCENE = ABOUT | {
+    "objects": [CARD],
+    "light": {"type": "uniform", "illuminance_lux": 3.0},
+    "camera": {"horizontal_fov_deg": 30.0},
+}
+TRACK = {"object": "b", "keyframes": [{"t_us": 0}, {"t_us": 7}]}
+DARK = {"type": "none"}
 POSE = {"t_us": 3, "matrix": pose()}
 OTHER_POSE = {"t_us": 3, "matrix": pose(last=0.99991, stretch=0.99996, shear=-9e-5)}
 RELATIONS = [  # model, keys that are right, what makes them wrong
@@ -56,6 +77,20 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
     (DeadLeavesTarget, LEAVES | {"reflectance_min": 0.39, "reflectance_max": 0.4}, {"reflectance_min": 0.4}),
     (DeadLeavesTarget, LEAVES | {"radius_max_m": 0.0021}, {"radius_max_m": 0.002}),
     (DeadLeavesTarget, LEAVES, {"radius_min_m": 0.00199}),
+    (MaterialShares, NO_MATERIAL | {"glass": 1e-9}, {"glass": 0.0}),
+    (BenchmarkSpec, SMALL, {"scenes": {"count": 0}}),
+    (BenchmarkSpec, SMALL, {"sensors": [{"sensor": "a b"}]}),
+    (BenchmarkSpec, SMALL, {"noise": [{"name": "a"}, {"name": "a"}]}),
+    (BenchmarkSpec, SMALL, {"seeds": [3, 3]}),
+    (BenchmarkSpec, SMALL, {"sensors": [{"sensor": "eiger"}, {"sensor": "x/eiger.yaml"}]}),
+    (BenchmarkSpec, SMALL | {"samples": 8}, {"sharp": {"times_us": [100]}}),
+    (BenchmarkSpec, SMALL | {"exposures_us": [[70, 70]]}, {"exposures_us": [[70, 69]]}),
+    (BenchmarkSpec, SMALL | {"seeds": list(range(1000))}, {"seeds": list(range(1001))}),
+    (BenchmarkSpec, SMALL | {"sharp": {"times_us": [500], "window_us": 1000}},
+     {"sharp": {"times_us": [499], "window_us": 1000}}),
+    (CaptureSpec, CAPTURE | {"evs_tile_rows": 2, "evs_tile_cols": 3}, {"evs_tile_rows": None}),
+    (CaptureSpec, CAPTURE | {"evs_tile_rows": 2, "evs_tile_cols": 3}, {"evs_tile_cols": None}),
+    (CaptureSpec, CAPTURE | {"tile_position": [1, 2]}, {"tile_position": [2, 1]}),
     (SplitShares, {"train": 0.5, "val": 0.3, "test": 0.2000005}, {"test": 0.200002}),
     (SplitShares, {"train": 0.5, "val": 0.3, "test": 0.1999995}, {"test": 0.199998}),
     (Steady, {"file": "a.raw", "lux": 3.0, "interval_us": [0, 1]}, {"interval_us": [1, 1]}),
@@ -80,6 +115,12 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
     (MeasuredPsf, PSF, {"kernels": [[[0.25, 0.25, 0.25, 0.25]]]}),
     (MeasuredPsf, PSF | {"kernels": [[[1.0] + [0.0] * 256]]}, {"kernels": [[[1.0] + [0.0] * 258]]}),
     (PhotoreceptorSpec, CORNER, {"min_cutoff_hz": 70.1}),
+    (PhotoreceptorSpec, CORNER, {"min_cutoff_hz": None}),
+    (PhotoreceptorSpec, CORNER, {"signal_dn": None}),
+    (PhotoreceptorSpec, FIRM, {"signal_dn": 3.0}),
+    (PhotoreceptorSpec, FIRM, {"min_cutoff_hz": 60.0}),
+    (PhotoreceptorSpec, FIRM, {"filters_noise": True}),
+    (PhotoreceptorSpec, FIRM, {"approach": "gradual"}),
     (TrackSpec, {"object": "a", "keyframes": [{"t_us": 0}, {"t_us": 1}]}, {"keyframes": [{"t_us": 1}, {"t_us": 1}]}),
     (DataSheetSpec, TWO, {"leak_hz": 1.7}),
     (DataSheetSpec, TWO, {"dark_lux": 0.3}),
@@ -88,6 +129,7 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
     (DataSheetSpec, TWO, {"background": [LIT]}),
     (DataSheetSpec, ONE, {"dark_lux": None}),
     (DataSheetSpec, FAST, {"speed": [SLOW, QUICK | {"lux": 5.0}]}),
+    (DyeSpec, {"edges": [[500.0, 1e-9, 2.0]]}, {"edges": [[500.0, 0.0, 2.0]]}),
     (DataSheetSpec, FAST, {"background": [], "dark_lux": None}),
     (DataSheetSpec, FAST, {"background": [DIM, LIT], "dark_lux": None}),
     (DataSheetSpec, FAST, {"background": [DIM, LIT]}),
@@ -107,6 +149,7 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
     (LightSpec, POINT, {"rotation_deg": 10.0}),
     (LightSpec, POINT, {"irradiance_w_m2": 3.0}),
     (LightSpec, POINT, {"illuminance_lux": None}),
+    (LightSpec, POINT | {"plane_normal": [0, 0, 1.1e-9]}, {"plane_normal": [0, 0, 0.9e-9]}),
     (LightSpec, {"type": "none"}, {"illuminance_lux": 3.0}),
     (LightSpec, {"type": "none"}, {"waveform": {"type": "mains", "frequency_hz": 50, "depth": 0.4}}),
     (MitsubaSpec, BOX, {"inline": {"a": {"type": "constant"}}}),
@@ -116,6 +159,21 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
     (MitsubaSpec, BOX | LEVEL, {"radiance_scale": 2.0}),
     (MitsubaSpec, BOX | LEVEL, {"plane_normal": None}),
     (MitsubaSpec, BOX, {"plane_point_m": [0, 0, 1]}),
+    (SceneSpec, SCENE | {"motion": [TRACK]}, {"motion": [TRACK, TRACK]}),
+    (SceneSpec, SCENE, {"objects": []}),
+    (SceneSpec, SCENE, {"objects": [CARD, CARD]}),
+    (SceneSpec, SCENE, {"objects": [CARD | {"name": "target"}]}),
+    (SceneSpec, SCENE, {"objects": [CARD | {"name": "camera"}]}),
+    (SceneSpec, SCENE, {"camera": None}),
+    (SceneSpec, SCENE, {"camera": {"fit": "target"}}),
+    (SceneSpec, ABOUT | {"mitsuba": BOX, "light": DARK}, {"light": POINT}),
+    (SceneSpec, ABOUT | {"mitsuba": BOX}, {"objects": [CARD]}),
+    (SceneSpec, ABOUT | {"mitsuba": BOX, "camera": {}}, {"camera": {"fit": "target"}}),
+    (SpectrumSpec, {"colorchecker": "cc_ohta", "patch": 24}, {"patch": None}),
+    (SpectrumSpec, {"colorchecker": "cc_ohta", "patch": 24}, {"patch": 25}),
+    (SpectrumSpec, {"colorchecker": "cc_ohta", "patch": 1}, {"patch": 0}),
+    (SpectrumSpec, {"peak_nm": 500.0, "fwhm_nm": 30.0}, {"fwhm_nm": None}),
+    (SpectrumSpec, {"peak_nm": 500.0, "fwhm_nm": 30.0}, {"flat": 0.3}),
     (KeyframeSpec, POSE, {"matrix": pose(last=1.0002)}),
     (KeyframeSpec, POSE, {"matrix": pose(stretch=1.0002)}),
     (KeyframeSpec, POSE, {"matrix": pose(shear=2e-4)}),
@@ -130,7 +188,13 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
     (VideoOptions, {"white_e_per_s": 3e5, "white_filter": "clear"}, {"white_filter": None}),
     (VideoOptions, {"white_e_per_s": 3e5, "white_filter": "clear"}, {"white_e_per_s": None}),
     (Region, {"x": 0, "y": 0, "width_px": 2**14, "height_px": 2**14}, {"width_px": 2**14 + 1}),
-    (ObjectSpec, {"name": "a", "shape": "rectangle", "size_m": [1, 2, 0]}, {"shape": "cube"}),
+    (ObjectSpec, {"name": "a", "shape": "mesh", "mesh": "a.obj"}, {"mesh": None}),
+    (ObjectSpec, {"name": "a", "shape": "mesh", "mesh": "a.obj"}, {"shape": "box"}),
+    (ObjectSpec, {"name": "a", "shape": "mesh", "mesh": "a.glb", "materials": "file"}, {"mesh": "a.obj"}),
+    (ObjectSpec, {"name": "a", "shape": "sphere", "size_m": [2, 2, 2]}, {"size_m": [2, 2, 2.001]}),
+    (ObjectSpec, {"name": "a", "shape": "box", "size_m": [2, 2, 2], "pattern": 0.3},
+     {"material": {"type": "diffuse", "reflectance": 0.2}}),
+    (ObjectSpec, {"name": "a", "shape": "rectangle", "size_m": [1, 2, 0]}, {"shape": "box"}),
     (ObjectSpec, {"name": "a", "shape": "rectangle", "size_m": [1, 2, 0]}, {"size_m": [1, 2, -1e-9]}),
 ]  # fmt: skip
 
@@ -138,8 +202,10 @@ RELATIONS = [  # model, keys that are right, what makes them wrong
 @pytest.mark.parametrize(("model", "right", "wrong"), RELATIONS)
 def test_keys_of_a_section(model, right, wrong):
     model.model_validate(right)
-    with pytest.raises(ValidationError):
+    with pytest.raises(ValidationError) as caught:
         model.model_validate(right | wrong)
+    # a relation, not the type or the limits of one key
+    assert [error["type"] for error in caught.value.errors()] == ["value_error"]
 
 
 SENSORS = [  # sensor, overrides that are right, what makes them wrong, and the message

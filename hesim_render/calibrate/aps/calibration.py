@@ -180,7 +180,8 @@ def analyse(
                 break
             bad |= unlike
     # the scene without noise, from all exposures; it shows pixels without a response as well
-    composite = compose(lit, dark, usable, np.zeros((*tile, 6)) if beta is None else beta)
+    assert beta is not None
+    composite = compose(lit, dark, usable, beta)
     bad |= used & _unresponsive(composite, tile)
     # the brightest signal: that at which pixels saturate, or else the end of the ADC above black
     top = spec.full_scale_dn - dark.black if saturation is None else saturation

@@ -82,9 +82,9 @@ def _out_of_reach(counts: NDArray, group: NDArray, trials: int, u: NDArray, reac
     high, low = ndtr(-u * max(1 - reach, 0.0)), ndtr(-u * (1 + reach))
     # Only counts far off need the exact tail.
     margin = 4.0
-    h, w = (trials * high)[group], (trials * low)[group]
+    far = [margin * np.sqrt(trials * p * (1 - p)) for p in (high, low)]
     result = np.zeros(counts.shape, bool)
-    over, under = counts > h + margin * np.sqrt(h), counts < w - margin * np.sqrt(w)
+    over, under = counts > (trials * high + far[0])[group], counts < (trials * low - far[1])[group]
     result[over] = binom.sf(counts[over] - 1, trials, high[group[over]]) < _CHANCE
     result[under] = binom.cdf(counts[under], trials, low[group[under]]) < _CHANCE
     return result

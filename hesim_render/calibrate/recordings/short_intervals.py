@@ -68,7 +68,7 @@ def _step(counts: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.fl
     if not enough.any():
         return place, np.full(place.size, 1 / place.size)
     # the step is that of the largest ratio of the densities, by its significance
-    gain = special.xlogy(below, (below + 0.5) / place) + special.xlogy(upper, (upper + 0.5) / (place + 1))
+    gain = special.xlogy(below, below / place) + special.xlogy(upper, upper / (place + 1))
     both = below + upper
     gain -= special.xlogy(both, both / (2 * place + 1))
     best = int(place[np.argmax(np.where(enough & (upper / (place + 1) > below / place), gain, -np.inf))])

@@ -40,7 +40,7 @@ class TargetThresholds(NamedTuple):
     ratio: dict[str, Any]
 
 
-def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak_hz: float = 0.0) -> TargetThresholds:
+def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak_hz: float) -> TargetThresholds:
     """θ₊, θ₋ and their relative mismatch over pixels, each with its interval, a jackknife over groups of pixels.
 
     Parameters

@@ -58,7 +58,7 @@ def blocks(cube: CubeFile) -> Iterator[NDArray[np.float32]]:
         yield cube.rows(first, min(first + step, rows))
 
 
-def integrated(cube: CubeFile, weights: NDArray[np.float64], shrink: int = 1) -> NDArray[np.float32]:
+def integrated(cube: CubeFile, weights: NDArray[np.float64], shrink: int) -> NDArray[np.float32]:
     """Integrals of a cube with spectra, averaged over squares of `shrink` × `shrink` texels; a rest is left out.
 
     Parameters
