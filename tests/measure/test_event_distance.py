@@ -334,7 +334,7 @@ def test_the_shortest_stream_has_two_windows_a_part():
 def test_bad_input_is_one_clear_error():
     rng = np.random.default_rng(1)
     few = made(np.arange(100) * 1000, rng.integers(0, PIXELS, 100), np.ones(100, int))
-    with pytest.raises(SpecError, match="few: has 100 events in 0.099 s; expected 2000"):
+    with pytest.raises(SpecError, match=r"few: has 100 events in 0\.099 s; expected 2000"):
         event_statistics(EventStream.of(few, SHAPE, "few"))
     with pytest.raises(SpecError, match="short: lasts 99 µs; expected 40000"):
         event_statistics(EventStream.of(made(np.arange(100), few["x"], few["polarity"]), SHAPE, "short"))

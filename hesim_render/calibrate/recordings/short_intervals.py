@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
+from scipy import special, stats
 
 from hesim_render.calibrate.estimate import Z_95, not_identifiable
 from hesim_render.calibrate.recordings.tally import LONG_US, WINDOW_US, EventTally
@@ -19,10 +19,14 @@ _LEAST_INTERVALS = 100
 _STRAY = 0.03
 #: Intervals in a step of the clock, over those of the fullest one, from which it is none of strays.
 _OF_CLOCK = 0.01
-#: Intervals from which a density is read: of the rise, of the counts at the edge, of each part after it.
-_OF_RISE, _OF_STEP, _OF_LEVEL = 30, 8, 400
-#: A count at the edge over the density there, above which the density is not known.
-_FALLS = 1.3
+#: Intervals from which a density is read: of the rise, of the counts at the edge, of each part after it, and the least
+#: steps of the clock in such a part.
+_OF_RISE, _OF_STEP, _OF_LEVEL, _LEAST_PART = 30, 8, 400, 4
+#: Relative error of a density that is read from parts next to it: real ones have waves.
+_UNEVEN = 0.02
+#: A density whose logarithm falls by more than this within the counts after the edge is not known there; chance of a
+#: count that is too large for the density.
+_FALLS, _CHANCE = 0.25, 1e-4
 #: Windows that must be equally full, and part of all windows of the same recording above which it is saturated.
 _LEAST_WINDOWS, _SATURATED = 20, 0.1
 #: Fullest windows differ by no more than this part, and than this part of what chance makes of as many events: those
@@ -48,19 +52,21 @@ def dead_time(tallies: Sequence[EventTally]) -> dict[str, Any]:
     counts = counts[::clock_us]
     edge = _steepest(counts)
     after = counts[edge : 2 * edge + 2]
+    # the density close to the edge: fast pixels have no long intervals
+    part = max(_LEAST_PART, int(np.searchsorted(np.cumsum(after), _OF_LEVEL)) + 1)
+    each = max(after[k : k + part].mean() for k in (0, min(part, after.size - 1)))
     shorter = counts[: max(1, round(0.8 * edge))]
-    if edge * clock_us < 2 or after.sum() < _LEAST_INTERVALS or shorter.mean() > _STRAY * after.mean():
+    if edge * clock_us < 2 or after.sum() < _LEAST_INTERVALS or shorter.mean() > _STRAY * each:
         clock = f" (times are whole numbers of {clock_us} µs)" if clock_us > 1 else ""
         return not_identifiable(
             f"the density of the intervals has no step: short intervals are as frequent as longer ones{clock}"
         )
-    each = after.mean()
     wide = int(np.ceil(_OF_RISE / each))
     rise = counts[: (2 * edge + 2) // wide * wide].reshape(-1, wide).sum(axis=1) / (wide * each)
     begin, end = (int(np.argmax(rise >= part)) * wide for part in (0.1, 0.9))
     margin = max(2, int(np.ceil(_OF_STEP / each)), end - edge + 1)
-    place, error, level = _place(counts, edge, margin)
-    if counts[edge : edge + margin + 1].max() > _FALLS * level + 4 * np.sqrt(level):
+    place, error, most = _place(counts, edge, margin, part)
+    if counts[edge : edge + margin + 1].max() > stats.poisson.isf(_CHANCE / margin, most):
         return not_identifiable(
             f"the density of the intervals falls at once after its step at {edge * clock_us} µs: its course within the "
             f"clock's steps of {clock_us} µs is not known"
@@ -70,9 +76,9 @@ def dead_time(tallies: Sequence[EventTally]) -> dict[str, Any]:
     if end - begin > 2 * wide:
         low, high = min(low, (begin - 1.0) * clock_us), max(high, (end + 1.0) * clock_us)
     return {
-        "value": place, "standard_error": error, "interval_95": [low, high], "unit": "µs",
+        "value": place, "standard_error": (high - low) / (2 * Z_95), "interval_95": [low, high], "unit": "µs",
         "note": f"the density reaches 10 % of what it is later at {begin * clock_us} µs and 90 % at "
-        f"{end * clock_us} µs; {int(counts[:edge].sum())} intervals are shorter",
+        f"{end * clock_us} µs; {int(counts[:begin].sum())} intervals are shorter",
     }  # fmt: skip
 
 
@@ -93,26 +99,27 @@ def _steepest(counts: NDArray[np.float64]) -> int:
     return int(place[np.argmax(np.where(rises, gain, -np.inf))]) if rises.any() else 0
 
 
-def _place(counts: NDArray[np.float64], edge: int, margin: int) -> tuple[float, float, float]:
+def _place(counts: NDArray[np.float64], edge: int, margin: int, part: int) -> tuple[float, float, float]:
     """Place of the sharp step and its standard error, in steps of the clock, from `margin` counts around the edge;
-    the density there.
+    the largest density there that goes with the one after it.
 
     A pair of times of steps of the clock has the interval k with the weight 1 − |x − k|, so that a sharp step at x lets
-    the counts k ≤ K be short of x + ½ whole ones. The density is read from two parts after the edge, and goes on
-    towards it as between them.
+    the counts k ≤ K be short of x + ½ whole ones. The density is read from two parts after them, each of `part`
+    counts, and goes on towards the edge as from one to the other.
     """
     first, last = max(edge - margin, edge // 2), edge + margin
-    part = int(np.clip(np.ceil(_OF_LEVEL / counts[edge : 2 * edge + 2].mean()), 2, max(edge // 2, 4)))
     near, far = (counts[last + 1 + k * part :][:part].sum() for k in range(2))
     # from the middle of the nearer part to that of the counts in between, in parts
     way = 0.5 + (0.5 * (margin + 1)) / part
-    level = near / part * (near / max(far, 1.0)) ** way
+    fall = np.log(max(near, 1.0) / max(far, 1.0))
+    level = near / part * np.exp(way * fall)
     stray = counts[:first].mean() if first else 0.0
     inside = counts[first : last + 1].sum()
     beyond = (inside - stray * (last + 1 - first)) / (level - stray)
-    of_level = np.sqrt((1 + way) ** 2 / max(near, 1.0) + way**2 / max(far, 1.0))
+    of_level = np.sqrt((1 + way) ** 2 / max(near, 1.0) + way**2 / max(far, 1.0) + _UNEVEN**2)
     error = np.hypot(np.sqrt(max(inside, 1.0)) / level, beyond * of_level)
-    return float(last + 0.5 - beyond), float(error), float(level)
+    most = level * np.exp(0.5 * margin / part * fall) * (1 + 4 * of_level) if way * fall < _FALLS else 0.0
+    return float(last + 0.5 - beyond), float(error), float(most)
 
 
 def readout_limit(tallies: Sequence[EventTally]) -> tuple[dict[str, Any], list[EventTally]]:
