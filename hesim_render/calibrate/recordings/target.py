@@ -29,9 +29,11 @@ from hesim_render.exchange.stream import EventStream
 _PIXELS, _WARM, _MOST_CYCLES = 8192, 4, 60
 #: Cycles, and ON and OFF events a cycle, that are needed.
 _LEAST_CYCLES, _LEAST_EVENTS = 3, 1.5
+#: Relative error of the variance of the thresholds, by pixels that see nearly the whole contrast.
+_PARTIAL = 0.06
 #: Relative difference of the rests of pixels that are taken together; most deviations of a pixel's counts, of those
 #: above the median, and the times that pixels beyond are taken out.
-_SAME_REST, _FAR, _CUTS = 0.15, 2.5, 6
+_SAME_REST, _FAR, _CUTS = 0.15, 3.0, 6
 
 
 class TargetThresholds(NamedTuple):
@@ -93,7 +95,7 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     # the swing of the level is that of the light and both overshoots, of which one bandwidth is not known
     swing = rise + course.top.mean() * fitted[0] + course.bottom.mean() * fitted[1]
     over = course.ends @ fitted[:2] / swing
-    beside = fitted * np.append(unsure, 0.0)
+    beside = fitted * np.append(unsure, _PARTIAL)
     errors = np.sqrt(jackknife(every) ** 2 + np.diag(of_simulated) + beside**2)
     if not np.all(np.isfinite([fitted, errors])):
         return unknown("no thresholds give the counts of this target: its contrast is another, or noise is too strong")
