@@ -268,6 +268,23 @@ def test_the_shortest_dead_time_is_judged_by_the_four_microseconds_after_it():
     assert "no step" in dead_time([SimpleNamespace(intervals=counts)])["reason"]
 
 
+@pytest.mark.parametrize(("fall", "is_known"), ((0.03, True), (0.12, False)))
+def test_a_density_that_falls_within_the_counts_at_its_edge_is_not_known(fall, is_known):
+    """From 5 µs on, 900 intervals in the first µs; stray ones before it are in each µs, and in the density after it."""
+    counts = np.zeros(LONG_US)
+    counts[5:] = 900 * np.exp(-fall * np.arange(LONG_US - 5.0))
+    found = dead_time([SimpleNamespace(intervals=counts)])
+    assert (found["value"] is not None) == is_known
+    if is_known:
+        assert found["value"] == pytest.approx(4.5, abs=0.02)
+        # counting, and 2 % of the density of three counts
+        assert 0.06 < found["standard_error"] < 0.25
+        stray = dead_time([SimpleNamespace(intervals=counts + 20.0)])
+        assert stray["value"] == pytest.approx(4.5, abs=0.02)
+    else:
+        assert "falls at once after its step at 5 µs" in found["reason"]
+
+
 def limited(rng, per_ms):
     """Events of a read-out that passes so many per ms, and is asked for more in two fifths of the time."""
     wanted = np.sort(np.concatenate([rng.uniform(0, 500_000, 60_000), rng.uniform(0, 200_000, 4 * 200 * per_ms)]))

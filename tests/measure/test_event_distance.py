@@ -245,9 +245,12 @@ def test_of_two_recordings_as_much_time_counts():
     (events,) = long.blocks()
     until_us = events["t_us"][0] + end_us - begin_us
     cut = EventStream.of(events[events["t_us"] <= until_us], SHAPE)
-    other, one = of_equal_time(replace(long, blocks=lambda: iter(np.array_split(events, 9))), short)
+    parts, read = np.array_split(events, 9), []
+    other, one = of_equal_time(replace(long, blocks=lambda: (read.append(part) or part for part in parts)), short)
+    read.clear()
     assert one.interval_us == (begin_us, end_us) and other.interval_us == (events["t_us"][0], until_us)
     found = event_statistics(other)
+    assert len(read) == 1 + np.argmax([part["t_us"][-1] > until_us for part in parts]) < 5  # no later ones are held
     expected = event_statistics(replace(cut, interval_us=other.interval_us))
     for name in ("polarity", "intervals", "series", "active", "bursts", "pixels"):
         assert np.array_equal(getattr(found, name), getattr(expected, name))
