@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -99,7 +100,7 @@ def event_statistics(stream: EventStream) -> EventStatistics:
     result: list[tuple[NDArray, ...]] = []
     # blocks of the file are cut at the ends of parts: only what belongs to the next part is held
     held, last_us = [no_events()], np.full(rows * cols, -1, np.int64)
-    for events in (*stream, no_events()):
+    for events in chain(stream, (no_events(),)):
         held.append(events)
         done = begin_us + (len(result) + 1) * part_us
         while len(result) < PARTS and (events.size == 0 or events["t_us"][-1] >= done):
