@@ -83,7 +83,7 @@ def test_pixels_that_see_less_of_the_target_and_parts_of_cycles_do_not_count():
     for rows, part, parts in ((20, 1.0, (0.41, 0.38)), (3, 0.6, (0.41, 0.38)), (3, 1.0, (0.25, 0.22))):
         mine = slice(begin * 23, (begin + rows) * 23)
         events = noisy_target_events(rng, on[mine], off[mine], part * rise, hz=hz, rests=parts, cycles=11,
-                                     shape=(rows, 23), sigma=(0.012, 0.008), cutoff_hz=25.0)  # fmt: skip
+                                     shape=(rows, 23), sigma=(0.012, 0.008), cutoff_hz=45.0)  # fmt: skip
         events["y"] += begin
         several.append(events)
         begin += rows

@@ -115,6 +115,8 @@ def _place(counts: NDArray[np.float64], edge: int, margin: int, part: int) -> tu
     level = near / part * np.exp(way * fall)
     stray = counts[:first].mean() if first else 0.0
     inside = counts[first : last + 1].sum()
+    if level <= 2 * stray or near == 0:
+        return float(edge), np.inf, 0.0  # nothing comes after the counts at the edge
     beyond = (inside - stray * (last + 1 - first)) / (level - stray)
     of_level = np.sqrt((1 + way) ** 2 / max(near, 1.0) + way**2 / max(far, 1.0) + _UNEVEN**2)
     error = np.hypot(np.sqrt(max(inside, 1.0)) / level, beyond * of_level)
