@@ -94,15 +94,16 @@ def compare(
     Rates, intervals, correlations, polarity, hot pixels and bursts, each as a distance with an interval.
     """
     from hesim_render.exchange import open_events
-    from hesim_render.measure.event_distance import event_distances, event_statistics
+    from hesim_render.measure.event_distance import PARTS, event_distances, event_statistics, of_equal_time
 
     shape = None if size is None else parse_size(size)
     console = Console(json_, quiet)
     with console.progress("compare") as move:
+        streams = of_equal_time(*(open_events(file, shape=shape, keep_stated=True) for file in (first, second)))
         statistics = []
-        for k, file in enumerate((first, second)):
+        for k, (file, stream) in enumerate(zip((first, second), streams, strict=True)):
             move(0.4 * k, 1.0, f"read {file.name}")
-            statistics.append(event_statistics(open_events(file, shape=shape, keep_stated=True)))
+            statistics.append(event_statistics(stream))
         move(0.8, 1.0, "compare")
         result = event_distances(statistics[0], statistics[1])
     lines = [f"{'':<11} {'distance':>9} {'95 % interval':>19} {'within first':>12}  {'first':>9} {'second':>9}"]
@@ -117,8 +118,10 @@ def compare(
     sizes = [f"{one.shape[1]}x{one.shape[0]}" for one in statistics]
     if sizes[0] != sizes[1]:
         lines.append(f"of {sizes[0]} and {sizes[1]} px, compared pixel by pixel: one should show what the other does")
+    seconds = PARTS * statistics[0].seconds
+    lines.append(f"over the first {seconds:.4g} s of each, which is all of the shorter one")
     lines += [f"{one.name}: {one.definition}" for one in result]
-    console.result("\n".join(lines), {"distances": [one.described() for one in result]})
+    console.result("\n".join(lines), {"seconds": seconds, "distances": [one.described() for one in result]})
 
 
 def report(

@@ -10,7 +10,8 @@ Statistics of a stream of events, each for successive parts of its time, so that
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -66,8 +67,24 @@ class EventStatistics:
     pixels: NDArray[np.uint32]
 
 
+def of_equal_time(first: EventStream, second: EventStream) -> tuple[EventStream, EventStream]:
+    """Two streams, each as long as the shorter one, from its begin.
+
+    Of one law, the longer one has longer intervals, other hot pixels and less scatter.
+    """
+    spans = [stream.span_us() for stream in (first, second)]
+    least_us = min(end_us - begin_us for begin_us, end_us in spans)
+    one, other = (
+        replace(stream, interval_us=(begin_us, begin_us + least_us))
+        for stream, (begin_us, _) in zip((first, second), spans, strict=True)
+    )
+    return one, other
+
+
 def event_statistics(stream: EventStream) -> EventStatistics:
     """Statistics of a stream, which is read twice; one part of its time is held at once.
+
+    Events after its end, where it has one of its own, are left out.
 
     Raises
     ------
@@ -83,7 +100,7 @@ def event_statistics(stream: EventStream) -> EventStatistics:
     result: list[tuple[NDArray, ...]] = []
     # blocks of the file are cut at the ends of parts: only what belongs to the next part is held
     held, last_us = [no_events()], np.full(rows * cols, -1, np.int64)
-    for events in (*stream, no_events()):
+    for events in chain(stream, (no_events(),)):
         held.append(events)
         done = begin_us + (len(result) + 1) * part_us
         while len(result) < PARTS and (events.size == 0 or events["t_us"][-1] >= done):
@@ -92,9 +109,12 @@ def event_statistics(stream: EventStream) -> EventStatistics:
             result.append(_part(every[:inside], begin_us + len(result) * part_us, part_us, last_us, rows, cols))
             held = [every[inside:]]
             done += part_us
+        if len(result) == PARTS:
+            break
     columns = [np.stack(values) for values in zip(*result, strict=True)]
     if columns[0].sum() < _LEAST_EVENTS:
-        raise SpecError(f"has {columns[0].sum()} events; expected {_LEAST_EVENTS} at least", file=stream.source)
+        problem = f"has {columns[0].sum()} events in {(end_us - begin_us) / US_PER_S:.4g} s"
+        raise SpecError(f"{problem}; expected {_LEAST_EVENTS} at least", file=stream.source)
     polarity, intervals, series, active, bursts, pixels = columns
     return EventStatistics(
         str(stream.source), (rows, cols), part_us / US_PER_S, polarity, intervals, series, active,

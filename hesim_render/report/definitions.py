@@ -95,9 +95,9 @@ EVENTS: dict[str, Definition] = {
     "dead_time": Definition(
         "dead time",
         "Time after an event in which a pixel gives no other, and in which the fastest light changes by a threshold: "
-        "where the density of the intervals steps up.",
-        "largest likelihood of a step from one density to another",
-        "all recordings; whole µs",
+        "where a step of the density of the intervals takes as many of them away as there are missing.",
+        "K + ½ − Σ n(k ≤ K)/n(after), k in steps of the clock",
+        "all recordings",
     ),
     "readout_limit": Definition(
         "read-out limit",

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal, norm
 from hesim_render.calibrate.asynchronous import analysis as trials_analysis
 from hesim_render.calibrate.asynchronous import fit as trials_fit
 from hesim_render.calibrate.asynchronous import likelihood
-from hesim_render.calibrate.evs import analysis, defects, dispersion, thresholds
+from hesim_render.calibrate.evs import defects, dispersion, thresholds
 from hesim_render.calibrate.evs import fit as events_fit
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.model import log_probability

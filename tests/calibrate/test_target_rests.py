@@ -72,6 +72,103 @@ def judged(of, tallies):
     return np.array(outcome)  # [recording, figure, hit and error]
 
 
+def test_pixels_that_see_less_of_the_target_and_parts_of_cycles_do_not_count():
+    """Of 26 rows three see 0.6 of the contrast, as at the corners of a checkerboard, and three rise and fall longer, as
+    in the middle of a star; 9.45 cycles begin at any place, but those of the left half alike.
+    """
+    rng, rise, hz, shape = np.random.default_rng(17), 2.1, 2.5, (26, 23)
+    size = shape[0] * shape[1]
+    on, off = 0.21 * (1 + 0.07 * rng.standard_normal(size)), 0.27 * (1 + 0.07 * rng.standard_normal(size))
+    several, begin = [], 0
+    for rows, part, parts in ((20, 1.0, (0.41, 0.38)), (3, 0.6, (0.41, 0.38)), (3, 1.0, (0.25, 0.22))):
+        mine = slice(begin * 23, (begin + rows) * 23)
+        events = noisy_target_events(rng, on[mine], off[mine], part * rise, hz=hz, rests=parts, cycles=11,
+                                     shape=(rows, 23), sigma=(0.012, 0.008), cutoff_hz=45.0)  # fmt: skip
+        events["y"] += begin
+        several.append(events)
+        begin += rows
+    events = np.concatenate(several)
+    events = np.sort(events[events["t_us"] < 9.45e6 / hz], order="t_us", kind="stable")
+    stream = EventStream(lambda: iter(np.array_split(events, 5)), shape)
+    one = target.of_whole_cycles(stream, tally(stream), None)
+    assert one.seconds == pytest.approx(9 / hz, rel=0.003) and one.counts.sum() < 0.97 * events.size
+    kept = target.seen_alike(one).reshape(shape)
+    assert kept[:20].mean() > 0.9 and kept[20:].mean() < 0.1
+    found = target.thresholds(one, np.exp(rise), None)
+    for name, value, within in (
+        ("theta_on", 0.21, 0.04),
+        ("theta_off", 0.27, 0.04),
+        ("threshold_mismatch_rel", 0.07, 0.1),
+    ):
+        entry = found.entries[name]
+        assert entry["value"] == pytest.approx(value, rel=within), name
+        assert entry["interval_95"][0] <= value <= entry["interval_95"][1], name
+    assert found.ratio["value"] == pytest.approx(0.27 / 0.21, rel=0.01)
+
+
+def test_late_events_count_where_the_rest_of_nearly_all_pixels_has_begun():
+    """Rests of 0.2 s and more, those of a twentieth of the pixels end 31 ms earlier; others are not looked at."""
+    gap_us = np.tile(np.linspace(0.2e6, 0.2e6 + 40, 81), 5) + np.repeat([-4000.0, 0, 0, 0, 9000.0], 81)
+    one = SimpleNamespace(only=np.arange(405) >= 0, gap_us=np.array([3 * gap_us, gap_us]), turns=np.full((2, 405), 3))
+    assert rests._later_s(one, 0) == pytest.approx(4.0e-3 + 10e-6, abs=6e-6)
+    one.only = np.repeat([False, True, True, True, False], 81)
+    assert rests._later_s(one, 0) == pytest.approx(18e-6, abs=1e-6) and rests._later_s(one, 1) < 7e-6
+    one.only = None
+    assert rests._later_s(one, 0) == 0
+
+
+def star(rng, shape):
+    """Place in the cycle [pixel] and length of a rise, cycles, of a star that turns, seen with a blur of 1.2 px."""
+    y, x = np.indices(shape).reshape(2, -1) + 0.5
+    y, x = y - shape[0] * rng.uniform(0.3, 0.7), x - shape[1] * rng.uniform(0.3, 0.7)
+    spokes = rng.integers(5, 10)
+    wide = np.clip(1.2 * spokes / (2 * np.pi * np.maximum(np.hypot(x, y), 0.5)), 0, 0.5)
+    return spokes * np.arctan2(y, x) / (2 * np.pi), wide, np.zeros(x.size)
+
+
+def checkerboard(rng, shape):
+    """The same of a checkerboard that passes, blur 1.5 px; the last: part of the row of fields beside the pixel's."""
+    y, x = np.indices(shape).reshape(2, -1) + 0.5
+    period = rng.uniform(14, 22)
+    row, inside = np.divmod(2 * y / period, 1)
+    beside = np.clip(0.5 - np.minimum(inside, 1 - inside) * period / 3, 0, 0.5)
+    return x / period + 0.5 * (row % 2), np.full(x.size, 1.5 / period), beside
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", (star, checkerboard))
+def test_intervals_hold_the_thresholds_of_stars_and_checkerboards(kind):
+    """Fewer than 9 of 12 have a chance of 2e-3 where 95 of 100 are expected; thresholds within 2 % rms."""
+    inside, away = np.zeros(4), []
+    for seed in range(300, 312):
+        rng = np.random.default_rng(seed)
+        shape = int(rng.integers(17, 27)), int(rng.integers(29, 47))
+        size, theta_on, ratio = shape[0] * shape[1], rng.uniform(0.14, 0.32), rng.choice([0.72, 0.81, 1.25, 1.4])
+        mismatch, rise, hz = rng.uniform(0.03, 0.14), rng.uniform(1.6, 2.5), rng.uniform(1.5, 4.0)
+        on, off = (theta * (1 + mismatch * rng.standard_normal(size)) for theta in (theta_on, theta_on * ratio))
+        place, wide, beside = kind(rng, shape)
+        dark = np.exp(-rise)
+
+        def light(at, place=place, wide=wide, beside=beside, dark=dark, rise=rise):
+            to_edge = np.abs((at + place + 0.25) % 1 - 0.5)  # of the middle of the bright part, cycles
+            bright = np.clip(0.5 + (0.25 - to_edge) / wide, 0, 1)
+            bright = bright * (1 - beside) + (1 - bright) * beside
+            return 1 + np.log(dark + (1 - dark) * bright) / rise
+
+        noise, leak_hz = theta_on * rng.uniform(1 / 40, 1 / 12), rng.uniform(0, 0.3)
+        events = noisy_target_events(
+            rng, on, off, rise, hz=hz, rests=(0, 0), cycles=12, shape=shape, sigma=(noise, noise),
+            cutoff_hz=float(np.exp(rng.uniform(np.log(80), np.log(300)))), drift=leak_hz * theta_on, light=light,
+        )  # fmt: skip
+        stream = EventStream.of(events[events["t_us"] < 1e6 * rng.uniform(8, 12) / hz], shape)
+        one = target.of_whole_cycles(stream, tally(stream), None)
+        found = judged((theta_on, ratio, mismatch, None, None, leak_hz, rise), [one])[0]
+        inside += found[:, 0]
+        away.append(found[:2, 1])
+    assert inside.min() >= 9, inside
+    assert np.sqrt(np.mean(np.square(away))) < 0.02, away
+
+
 @pytest.mark.parametrize(
     ("cutoff_hz", "drift", "slopes", "rest_s"),
     [(41.0, 0.0, (90.0, 130.0), 0.31), (41.0, 0.9, (70.0, 40.0), 0.17), (83.0, -0.7, (60.0, 95.0), 0.23)],
@@ -264,7 +361,7 @@ def tally_of(late, uneven=0.0):
     times = (174_000, 138_000, 70_000)  # before the first event of the fall, which comes 4 ms after the rest
     gaps = np.array([histogram((230_000, 4000), *zip(times, part * np.array(late), strict=True)) for part in share])
     same = [[histogram((us, 90))] * GROUPS for us in (5000, 4000)]
-    return SimpleNamespace(gaps=np.array([gaps, gaps]), same=np.array(same), period_s=lambda: 0.7)
+    return SimpleNamespace(only=None, gaps=np.array([gaps, gaps]), same=np.array(same), period_s=lambda: 0.7)
 
 
 @pytest.mark.parametrize(("last", "uneven", "noisy"), [(30, 0.0, False), (47, 0.1, False), (49, 0.6, True)])

@@ -56,6 +56,11 @@ def test_compare_prints_a_line_a_distance(capsys, recordings):
     lines = {line.split("  ")[0]: line for line in text.splitlines()}
     assert lines["rate"].endswith("differs") and not lines["hot pixels"].endswith("differs")
     status, text, _ = call(capsys, "compare", *recordings, "--size", "21x15", "--json")
+    seconds = json.loads(text)["seconds"]
+    assert (
+        f"over the first {seconds:.4g} s of each, which is all of the shorter one" in lines
+        and seconds == pytest.approx(1.2, abs=0.01)
+    )
     for one in json.loads(text)["distances"]:
         low, high = (f"{end:.4g}" for end in one["interval_95"])
         assert f"{one['value']:.4g}" in lines[one["name"]] and f" {low} to {high} " in lines[one["name"]]

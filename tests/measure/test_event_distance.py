@@ -1,5 +1,6 @@
 """Distances of two streams of events: equal laws are not far apart, each change shows in its own figure."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from hesim_render.core.errors import SpecError
 from hesim_render.exchange import EventStream
 from hesim_render.measure import event_distance
-from hesim_render.measure.event_distance import event_distances, event_statistics
+from hesim_render.measure.event_distance import event_distances, event_statistics, of_equal_time
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
 SHAPE, SECONDS, RATE_HZ = (31, 37), 2.6, 21.0
@@ -218,6 +219,47 @@ def test_pixels_that_know_nothing_of_one_another_have_no_correlation():
     assert np.all(np.abs(found) < 4 * 0.0013 / np.sqrt(12))
 
 
+def halves(seed):
+    """A process of pixels of unlike rates, some hot, of which 0.5 s are one stream and the 4 s after it another."""
+    rng = np.random.default_rng(seed)
+    rate_hz = 9.0 * np.exp(0.6 * rng.standard_normal(PIXELS))
+    rate_hz[rng.integers(0, PIXELS, 6)] += rng.uniform(100, 400, 6)
+    pixel = np.repeat(np.arange(PIXELS), rng.poisson(4.5 * rate_hz))
+    t_us = rng.integers(0, 4_500_000, pixel.size)
+    on = np.where(rng.random(pixel.size) < rng.uniform(0.4, 0.7, PIXELS)[pixel], 1, -1)
+    is_short = t_us < 500_000
+    return [EventStream.of(made(t_us[kept], pixel[kept], on[kept]), SHAPE) for kept in (is_short, ~is_short)]
+
+
+def test_a_shorter_recording_of_the_same_does_not_differ():
+    """Of 28 figures, at 5 % each, six or more differ with a chance of 2e-3."""
+    streams = [halves(seed)[:: 1 if seed % 2 else -1] for seed in range(4)]
+    both = [[event_statistics(one) for one in of_equal_time(*pair)] for pair in streams]
+    assert sum(one.differs for pair in both for one in event_distances(*pair)) < 6
+
+
+def test_of_two_recordings_as_much_time_counts():
+    """As of the longer one without its later events; without events enough in it, it is refused."""
+    short, long = halves(5)
+    begin_us, end_us = short.span_us()
+    (events,) = long.blocks()
+    until_us = events["t_us"][0] + end_us - begin_us
+    cut = EventStream.of(events[events["t_us"] <= until_us], SHAPE)
+    parts, read = np.array_split(events, 9), []
+    other, one = of_equal_time(replace(long, blocks=lambda: (read.append(part) or part for part in parts)), short)
+    read.clear()
+    assert one.interval_us == (begin_us, end_us) and other.interval_us == (events["t_us"][0], until_us)
+    found = event_statistics(other)
+    assert len(read) == 1 + np.argmax([part["t_us"][-1] > until_us for part in parts]) < 5  # no later ones are held
+    expected = event_statistics(replace(cut, interval_us=other.interval_us))
+    for name in ("polarity", "intervals", "series", "active", "bursts", "pixels"):
+        assert np.array_equal(getattr(found, name), getattr(expected, name))
+    assert found.seconds == event_statistics(short).seconds and found.polarity.sum() == cut.count() < events.size
+    late = EventStream.of(np.append(events[:900], events[-3000:]), SHAPE, "late")
+    with pytest.raises(SpecError, match=r"late: has 900 events in 0\.4\d+ s; expected 2000"):
+        event_statistics(of_equal_time(late, short)[0])
+
+
 @pytest.mark.parametrize("part", (0, 19))
 def test_each_part_is_drawn(part):
     """All but a few events are in one part, two of three ON: a draw has it, or not, and then as many of both."""
@@ -295,7 +337,7 @@ def test_the_shortest_stream_has_two_windows_a_part():
 def test_bad_input_is_one_clear_error():
     rng = np.random.default_rng(1)
     few = made(np.arange(100) * 1000, rng.integers(0, PIXELS, 100), np.ones(100, int))
-    with pytest.raises(SpecError, match="few: has 100 events; expected 2000"):
+    with pytest.raises(SpecError, match=r"few: has 100 events in 0\.099 s; expected 2000"):
         event_statistics(EventStream.of(few, SHAPE, "few"))
     with pytest.raises(SpecError, match="short: lasts 99 µs; expected 40000"):
         event_statistics(EventStream.of(made(np.arange(100), few["x"], few["polarity"]), SHAPE, "short"))

@@ -78,13 +78,16 @@ def target_events(rng, theta_on, theta_off, rise, *, hz, cycles, shape, sigma=0.
     return _events(found, shape[1])
 
 
-def noisy_target_events(rng, theta_on, theta_off, rise, *, hz, rests, cycles, shape, sigma, cutoff_hz, drift=0.0):
+def noisy_target_events(
+    rng, theta_on, theta_off, rise, *, hz, rests, cycles, shape, sigma, cutoff_hz, drift=0.0, light=None
+):
     """Events of pixels that see bars pass by: the logarithm of the light rises, rests, falls and rests.
 
     Parameters
     ----------
     rests : parts of a cycle for which the light rests at its top and at its bottom; it rises and falls equally long.
     sigma : of the noise in the dark and in the bright light; it has two equal poles of corner `cutoff_hz`.
+    light : part of the rise [pixel] at a place of the cycle, in place of that of `rests` at random phases.
     """
     pole = 2 * np.pi * cutoff_hz / np.sqrt(np.sqrt(2) - 1)
     steps, size = max(round(16 * cutoff_hz / hz), 200), theta_on.size
@@ -100,7 +103,8 @@ def noisy_target_events(rng, theta_on, theta_off, rise, *, hz, rests, cycles, sh
     found = [(np.empty(0, int), np.empty(0, int), np.empty(0, int))]
     for k in range(-2 * steps, cycles * steps):
         state = move @ state + fresh @ rng.standard_normal(state.shape)
-        part = np.interp((k / steps + phase) % 1, turns, [0.0, 1.0, 1.0, 0.0, 0.0])
+        place = (k / steps + phase) % 1 if light is None else k / steps
+        part = np.interp(place, turns, [0.0, 1.0, 1.0, 0.0, 0.0]) if light is None else light(place)
         level = rise * part + (sigma[0] + (sigma[1] - sigma[0]) * part) * state[0]
         reference = reference - drift * dt
         for sign, theta in ((1, theta_on), (-1, theta_off)):

@@ -81,6 +81,8 @@ def calibrate_recordings(
             problem = f"is of {stream.shape[1]}x{stream.shape[0]} px, not of the crop's {shape[1]}x{shape[0]}"
             raise SpecError(f"{problem}; where it counts the pixels of the whole sensor, leave out the crop", file=name)
         tallies.append(tally(stream))
+    if target_file is not None:
+        tallies[-1] = target.of_whole_cycles(stream, tallies[-1], target_hz)
     report("fit", len(every) / (len(every) + 1))
     moving = tallies.pop() if target_file is not None else None
     result = figures(

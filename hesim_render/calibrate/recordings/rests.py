@@ -36,6 +36,8 @@ _LAW_ERROR = 0.05
 _STRONG = 1.4
 #: First late events that count: at this part of the rest, and after so many intervals of the ramp.
 _EARLY, _INTERVALS = 1 / 64, 4.0
+#: Part of the pixels whose rest may begin later than late events count.
+_LATEST = 0.05
 #: A rest shorter than this part of the period is none.
 _LEAST_REST = 0.1
 #: Gaps above the median differ by this much at most, where all pixels see the same rests.
@@ -183,7 +185,7 @@ def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] 
         spread_s = up_s + down_s / own
         if rest_s < _LEAST_REST * period_s or upper_s - middle_s > _SAME_RESTS * middle_s + spread_s:
             return None
-        first_s = max(_EARLY * rest_s, _INTERVALS * max(up_s, down_s))
+        first_s = max(_EARLY * rest_s, _INTERVALS * max(up_s, down_s), _later_s(tally, k))
         octaves = np.arange(np.floor(np.log2(rest_s / first_s)), -1, -1)
         edges_s = np.asarray(rest_s / 2.0**octaves, np.float64)
         if edges_s.size < 2:
@@ -208,6 +210,14 @@ def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] 
         of_groups = max(float(scatter), 1.0)
         result.append(Rest(ramps, edges_s, late.sum(axis=0, dtype=np.float64), float(whole.sum()), of_groups, False))
     return result[0]._replace(is_noisy=is_noisy), result[1]._replace(is_noisy=is_noisy)
+
+
+def _later_s(tally: EventTally, polarity: int) -> float:
+    """By how much the rest of pixels begins later than that of most: what comes until then may be of the ramp, s."""
+    if tally.only is None:
+        return 0.0
+    own_us = (tally.gap_us[polarity] / np.maximum(tally.turns[polarity], 1))[tally.only]
+    return float(np.median(own_us) - np.quantile(own_us, _LATEST)) * S_PER_US
 
 
 def _leaks(rest: Rest) -> NDArray[np.float64]:

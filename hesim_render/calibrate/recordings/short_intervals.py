@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
+from scipy import special, stats
 
-from hesim_render.calibrate.estimate import not_identifiable
+from hesim_render.calibrate.estimate import Z_95, not_identifiable
 from hesim_render.calibrate.recordings.tally import LONG_US, WINDOW_US, EventTally
 from hesim_render.core.units import US_PER_S
 
@@ -17,6 +17,16 @@ from hesim_render.core.units import US_PER_S
 _LEAST_INTERVALS = 100
 #: Largest density of intervals below 0.8 of the dead time, over that above: strays of the read-out.
 _STRAY = 0.03
+#: Intervals in a step of the clock, over those of the fullest one, from which it is none of strays.
+_OF_CLOCK = 0.01
+#: Intervals from which a density is read: of the rise, of the counts at the edge, of each part after it, and the least
+#: steps of the clock in such a part.
+_OF_RISE, _OF_STEP, _OF_LEVEL, _LEAST_PART = 30, 8, 400, 4
+#: Relative error of a density that is read from parts next to it: real ones have waves.
+_UNEVEN = 0.02
+#: A density whose logarithm falls by more than this within the counts after the edge is not known there; chance of a
+#: count that is too large for the density.
+_FALLS, _CHANCE = 0.25, 1e-4
 #: Windows that must be equally full, and part of all windows of the same recording above which it is saturated.
 _LEAST_WINDOWS, _SATURATED = 20, 0.1
 #: Fullest windows differ by no more than this part, and than this part of what chance makes of as many events: those
@@ -27,60 +37,91 @@ _SILENT = 0.02
 
 
 def dead_time(tallies: Sequence[EventTally]) -> dict[str, Any]:
-    """Dead time in µs: where the density of the intervals of a pixel steps up.
+    """Dead time in µs: the place of a sharp step of the density of a pixel's intervals that takes as much away.
 
-    The likelihood of a step from one density to another, over the whole µs; its place has a flat prior, both densities
-    are those of the counts on either side. The interval holds 95 % of the posterior, and half a µs on either side for
-    the times, which are whole.
+    Times that are whole numbers of the clock's steps, and a read-out that delays events at random, make the step a
+    gradual one, from which as many intervals are missing. Their number over the density after the step is the place.
+    Where the density rises over more than two steps of the clock, the interval holds the whole rise: recovery, unlike
+    pixels and delays look the same.
     """
     counts = np.sum([one.intervals for one in tallies], axis=0)[:LONG_US].astype(np.float64)
     if counts.sum() < _LEAST_INTERVALS:
         reason = f"{int(counts.sum())} intervals are shorter than {LONG_US / 1000:g} ms; {_LEAST_INTERVALS} are needed"
         return not_identifiable(reason)
-    place, chance = _step(counts)
-    end = int(place[np.argmax(chance)])
-    after = counts[end : 2 * end + 2]
-    shorter = counts[: max(1, round(0.8 * end))]
-    if end < 2 or after.sum() < _LEAST_INTERVALS or shorter.mean() > _STRAY * after.mean():
+    clock_us = _clock_us(counts)
+    counts = counts[::clock_us]
+    edge = _steepest(counts)
+    after = counts[edge : 2 * edge + 2]
+    # the density close to the edge: fast pixels have no long intervals
+    part = max(_LEAST_PART, int(np.searchsorted(np.cumsum(after), _OF_LEVEL)) + 1)
+    each = max(after[k : k + part].mean() for k in (0, min(part, after.size - 1)))
+    shorter = counts[: max(1, round(0.8 * edge))]
+    if edge * clock_us < 2 or after.sum() < _LEAST_INTERVALS or shorter.mean() > _STRAY * each:
+        clock = f" (times are whole numbers of {clock_us} µs)" if clock_us > 1 else ""
         return not_identifiable(
-            "the density of the intervals has no step: short intervals are as frequent as longer ones"
+            f"the density of the intervals has no step: short intervals are as frequent as longer ones{clock}"
         )
-    whole = np.cumsum(chance)
-    low, high = (float(place[np.searchsorted(whole, part)]) for part in (0.025, 0.975))
-    mean = float(np.sum(place * chance))
-    level = np.cumsum(after)[-1] / after.size
-    smooth = counts[: 2 * end + 2] / level
-    reached = [int(np.argmax(smooth >= part)) for part in (0.1, 0.9)]
+    wide = int(np.ceil(_OF_RISE / each))
+    rise = counts[: (2 * edge + 2) // wide * wide].reshape(-1, wide).sum(axis=1) / (wide * each)
+    begin, end = (int(np.argmax(rise >= part)) * wide for part in (0.1, 0.9))
+    margin = max(2, int(np.ceil(_OF_STEP / each)), end - edge + 1)
+    place, error, most = _place(counts, edge, margin, part)
+    if counts[edge : edge + margin + 1].max() > stats.poisson.isf(_CHANCE / margin, most):
+        return not_identifiable(
+            f"the density of the intervals falls at once after its step at {edge * clock_us} µs: its course within the "
+            f"clock's steps of {clock_us} µs is not known"
+        )
+    place, error = place * clock_us, error * clock_us
+    low, high = place - Z_95 * error, place + Z_95 * error
+    if end - begin > 2 * wide:
+        low, high = min(low, (begin - 1.0) * clock_us), max(high, (end + 1.0) * clock_us)
     return {
-        "value": mean, "standard_error": float(np.sqrt(np.sum((place - mean) ** 2 * chance) + 1 / 6)),
-        "interval_95": [low - 0.5, high + 0.5], "unit": "µs",
-        "note": f"the density reaches 10 % of what it is later at {reached[0]} µs and 90 % at {reached[1]} µs; "
-        f"{int(counts[:end].sum())} intervals are shorter",
+        "value": place, "standard_error": (high - low) / (2 * Z_95), "interval_95": [low, high], "unit": "µs",
+        "note": f"the density reaches 10 % of what it is later at {begin * clock_us} µs and 90 % at "
+        f"{end * clock_us} µs; {int(counts[:begin].sum())} intervals are shorter",
     }  # fmt: skip
 
 
-def _step(counts: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Places of a step of the density, whole µs, and their chances. A place d compares [0, d) with [d, 2 d]."""
+def _clock_us(counts: NDArray[np.float64]) -> int:
+    """Step of the times, µs: what all intervals but a few strays are multiples of."""
+    return max(int(np.gcd.reduce(np.flatnonzero(counts > _OF_CLOCK * counts.max()))), 1)
+
+
+def _steepest(counts: NDArray[np.float64]) -> int:
+    """Place d of the most significant rise of the density, from [0, d) to [d, 2 d]; 0 if there is none."""
     total = np.append(0.0, np.cumsum(counts))
     place = np.arange(1, counts.size // 2)
     below, upper = total[place], total[2 * place + 1] - total[place]
-    enough = upper >= _LEAST_INTERVALS
-    if not enough.any():
-        return place, np.full(place.size, 1 / place.size)
-    # the step is that of the largest ratio of the densities, by its significance
     gain = special.xlogy(below, below / place) + special.xlogy(upper, upper / (place + 1))
     both = below + upper
     gain -= special.xlogy(both, both / (2 * place + 1))
-    best = int(place[np.argmax(np.where(enough & (upper / (place + 1) > below / place), gain, -np.inf))])
-    window = np.arange(2 * best + 1)
-    inside = counts[: window.size]
-    sums = np.append(0.0, np.cumsum(inside))
-    d = np.arange(1, window.size)
-    low = (sums[d] + 0.5) / d
-    high = (sums[-1] - sums[d] + 0.5) / (window.size - d)
-    log = special.xlogy(sums[d], low) - low * d + special.xlogy(sums[-1] - sums[d], high) - high * (window.size - d)
-    chance = np.exp(log - log.max())
-    return d, chance / chance.sum()
+    rises = (upper >= _LEAST_INTERVALS) & (upper / (place + 1) > below / place)
+    return int(place[np.argmax(np.where(rises, gain, -np.inf))]) if rises.any() else 0
+
+
+def _place(counts: NDArray[np.float64], edge: int, margin: int, part: int) -> tuple[float, float, float]:
+    """Place of the sharp step and its standard error, in steps of the clock, from `margin` counts around the edge;
+    the largest density there that goes with the one after it.
+
+    A pair of times of steps of the clock has the interval k with the weight 1 − |x − k|, so that a sharp step at x lets
+    the counts k ≤ K be short of x + ½ whole ones. The density is read from two parts after them, each of `part`
+    counts, and goes on towards the edge as from one to the other.
+    """
+    first, last = max(edge - margin, edge // 2), edge + margin
+    near, far = (counts[last + 1 + k * part :][:part].sum() for k in range(2))
+    # from the middle of the nearer part to that of the counts in between, in parts
+    way = 0.5 + (0.5 * (margin + 1)) / part
+    fall = np.log(max(near, 1.0) / max(far, 1.0))
+    level = near / part * np.exp(way * fall)
+    stray = counts[:first].mean() if first else 0.0
+    inside = counts[first : last + 1].sum()
+    if level <= 2 * stray or near == 0:
+        return float(edge), np.inf, 0.0  # nothing comes after the counts at the edge
+    beyond = (inside - stray * (last + 1 - first)) / (level - stray)
+    of_level = np.sqrt((1 + way) ** 2 / max(near, 1.0) + way**2 / max(far, 1.0) + _UNEVEN**2)
+    error = np.hypot(np.sqrt(max(inside, 1.0)) / level, beyond * of_level)
+    most = level * np.exp(0.5 * margin / part * fall) * (1 + 4 * of_level) if way * fall < _FALLS else 0.0
+    return float(last + 0.5 - beyond), float(error), float(most)
 
 
 def readout_limit(tallies: Sequence[EventTally]) -> tuple[dict[str, Any], list[EventTally]]:

@@ -37,6 +37,7 @@ class EventTally:
     source : name of the recording, for errors.
     shape : rows and columns, px.
     begin_us, end_us : time of the recording, µs.
+    only : [pixel], pixels whose `same`, `gaps` and `turns_us` count; None: all.
 
     Attributes
     ----------
@@ -50,12 +51,14 @@ class EventTally:
     same, gaps : [first polarity, group of pixels, step], intervals between successive events of a pixel of the same
         polarity, and of different ones, in logarithmic steps.
     turns_us : first times between successive turns of a pixel from OFF to ON events, at most `TURNS`.
+    gap_us, turns : [first polarity, pixel], sums and numbers of the intervals between events of different polarity.
     """
 
     source: str
     shape: tuple[int, int]
     begin_us: int
     end_us: int
+    only: NDArray[np.bool_] | None = None
     counts: NDArray[np.int64] = field(init=False)
     slices: NDArray[np.int64] = field(init=False)
     intervals: NDArray[np.int64] = field(init=False)
@@ -67,6 +70,8 @@ class EventTally:
     same: NDArray[np.int64] = field(init=False)
     gaps: NDArray[np.int64] = field(init=False)
     turns_us: list[NDArray[np.int64]] = field(init=False)
+    gap_us: NDArray[np.float64] = field(init=False)
+    turns: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
         pixels = self.pixels
@@ -75,6 +80,7 @@ class EventTally:
         self.variation, self.pairs = np.zeros(pixels), np.zeros(pixels, np.int64)
         self.waves, self.used = np.zeros((len(LAMPS_HZ), SLICES), np.complex128), np.ones(pixels, np.bool_)
         self.same, self.gaps = np.zeros((2, 2, GROUPS, STEPS), np.int64)
+        self.gap_us, self.turns = np.zeros((2, pixels)), np.zeros((2, pixels), np.int64)
         self.turns_us, self._turns, self._turn_us = [], 0, np.full(pixels, -1, np.int64)
         # group of each pixel: neighbours and columns are spread over all groups
         self.group = (np.arange(pixels, dtype=np.uint64) * np.uint64(2654435761) >> np.uint64(16)) % np.uint64(GROUPS)
@@ -110,6 +116,11 @@ class EventTally:
         known = before_us >= 0
         self.intervals += np.bincount(np.minimum((t_us - before_us)[known], LONG_US), minlength=LONG_US + 1)
         was_on = np.where(first, self._last_on[pixel], np.append(False, on[:-1]))
+        for k, is_turn in enumerate((known & was_on & ~on, known & ~was_on & on)):
+            self.gap_us[k] += np.bincount(pixel[is_turn], (t_us - before_us)[is_turn], self.pixels)
+            self.turns[k] += np.bincount(pixel[is_turn], minlength=self.pixels)
+        if self.only is not None:
+            known = known & self.only[pixel]
         self._successions(known, was_on, on, pixel, t_us - before_us)
         turn = known & on & ~was_on
         self._take_turns(pixel[turn], t_us[turn])
@@ -203,8 +214,13 @@ class EventTally:
         return cast(NDArray[np.int64], self.counts.sum(axis=1))
 
 
-def tally(stream: EventStream) -> EventTally:
+def tally(stream: EventStream, only: NDArray[np.bool_] | None = None) -> EventTally:
     """The tally of a recording, which is read twice, block by block.
+
+    Parameters
+    ----------
+    stream : events; those after its end, where it has one of its own, are left out.
+    only : see `EventTally`.
 
     Raises
     ------
@@ -215,8 +231,12 @@ def tally(stream: EventStream) -> EventTally:
     if end_us - begin_us < _LEAST_US:
         problem = "has no events" if end_us == begin_us == 0 else f"lasts {end_us - begin_us} µs"
         raise SpecError(f"{problem}; expected a recording of at least {_LEAST_US} µs", file=stream.source)
-    result = EventTally(str(stream.source), stream.shape, begin_us, end_us)
+    result = EventTally(str(stream.source), stream.shape, begin_us, end_us, only)
     for block in stream:
-        result.add(block)
+        events = block[: np.searchsorted(block["t_us"], end_us, side="right")]
+        if events.size:
+            result.add(events)
+        if events.size < block.size:
+            break
     result.finish()
     return result

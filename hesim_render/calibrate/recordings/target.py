@@ -10,6 +10,7 @@ bottom, noise carries the level further than the light; by how much is read from
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,14 +18,22 @@ from numpy.typing import NDArray
 from scipy import special
 
 from hesim_render.calibrate.estimate import Z_95, estimated, not_identifiable
-from hesim_render.calibrate.recordings.rests import overshoots, rests
+from hesim_render.calibrate.recordings.rests import overshoots, quantile_us, rests
 from hesim_render.calibrate.recordings.still import UNSURE_LEAK, jackknife
 from hesim_render.calibrate.recordings.tally import GROUPS, EventTally
+from hesim_render.calibrate.recordings.tally import tally as tally_of
+from hesim_render.core.units import US_PER_S
+from hesim_render.exchange.stream import EventStream
 
 #: Simulated pixels, cycles before their counts begin, and most cycles that are simulated.
 _PIXELS, _WARM, _MOST_CYCLES = 8192, 4, 60
 #: Cycles, and ON and OFF events a cycle, that are needed.
 _LEAST_CYCLES, _LEAST_EVENTS = 3, 1.5
+#: Relative error of the variance of the thresholds, by pixels that see nearly the whole contrast.
+_PARTIAL = 0.06
+#: Relative difference of the rests of pixels that are taken together; most deviations of a pixel's counts, of those
+#: above the median, and the times that pixels beyond are taken out.
+_SAME_REST, _FAR, _CUTS = 0.15, 3.0, 6
 
 
 class TargetThresholds(NamedTuple):
@@ -51,8 +60,7 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     leak_hz : leak while the target moved, Hz: half of it is in the ON events of the rise, half missing in the fall.
     """
     count = tally.per_pixel().astype(np.float64)
-    both = np.where(tally.used, count.min(axis=0), 0.0)
-    seen = both > 0.25 * np.median(both[both > 0]) if both.any() else np.zeros(both.size, np.bool_)
+    seen = seen_alike(tally)
     if np.count_nonzero(seen) < 2 * GROUPS:
         return unknown(f"{np.count_nonzero(seen)} pixels have events of both polarities; {2 * GROUPS} are needed")
     period_s = 1 / cycles_hz if cycles_hz is not None else tally.period_s()
@@ -87,7 +95,7 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     # the swing of the level is that of the light and both overshoots, of which one bandwidth is not known
     swing = rise + course.top.mean() * fitted[0] + course.bottom.mean() * fitted[1]
     over = course.ends @ fitted[:2] / swing
-    beside = fitted * np.append(unsure, 0.0)
+    beside = fitted * np.append(unsure, _PARTIAL)
     errors = np.sqrt(jackknife(every) ** 2 + np.diag(of_simulated) + beside**2)
     if not np.all(np.isfinite([fitted, errors])):
         return unknown("no thresholds give the counts of this target: its contrast is another, or noise is too strong")
@@ -155,6 +163,48 @@ def _course(tally: EventTally, leak_hz: float, period_s: float, ratio: float) ->
     return _Course(top.quantiles, bottom.quantiles, (drifts[0], drifts[1]), unsure, ends)
 
 
+def of_whole_cycles(stream: EventStream, first: EventTally, cycles_hz: float | None) -> EventTally:
+    """The tally of a target's whole cycles, in which every pixel sees as many rises as falls, wherever it begins; with
+    the times of those pixels alone that see the same light.
+
+    Parameters
+    ----------
+    stream, first : recording of the target, and its tally.
+    cycles_hz : see `thresholds`.
+    """
+    period_s = 1 / cycles_hz if cycles_hz is not None else first.period_s()
+    if period_s is None or first.seconds < period_s:
+        return first
+    end_us = first.begin_us + round(np.floor(first.seconds / period_s) * period_s * US_PER_S)
+    return tally_of(replace(stream, interval_us=(first.begin_us, end_us)), seen_alike(first))
+
+
+def seen_alike(tally: EventTally) -> NDArray[np.bool_]:
+    """Pixels [pixel] that see the whole contrast of the target, and rests as long as others do.
+
+    At the corners of a checkerboard and in the middle of a star the lens mixes bright and dark parts.
+    """
+    count = tally.per_pixel().astype(np.float64)
+    both = np.where(tally.used, count.min(axis=0), 0.0)
+    seen = both > 0.25 * np.median(both[both > 0]) if both.any() else np.zeros(both.size, np.bool_)
+    interval_us = max(quantile_us(same.sum(axis=0)) for same in tally.same)
+    gap_us = tally.gap_us / np.maximum(tally.turns, 1)
+    for own in gap_us if seen.any() else ():
+        middle = np.median(own[seen])
+        seen = seen & (np.abs(own - middle) <= max(_SAME_REST * middle, 2 * interval_us))
+    return _regular(count, seen)
+
+
+def _regular(count: NDArray[np.float64], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels of `seen` whose counts [polarity, pixel] are no farther from their median than those above it allow."""
+    for _ in range(_CUTS if np.count_nonzero(seen) > 2 * GROUPS else 0):
+        middle = np.median(count[:, seen], axis=1, keepdims=True)
+        share = (count / np.maximum(middle, 1e-300)).mean(axis=0)
+        half, upper = np.quantile(share[seen], (0.5, 0.84))
+        seen = seen & (np.abs(share - half) <= _FAR * max(upper - half, 1 / max(float(middle.min()), 1e-300)))
+    return seen
+
+
 def unknown(reason: str) -> TargetThresholds:
     """Figures of a target that tells none, with the reason."""
     entry = not_identifiable(reason)
@@ -188,12 +238,14 @@ class _Simulated:
 
     def moments(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """`_moments` of θ₊, θ₋ and the variance of the relative mismatch."""
-        return _moments(self._counts(values))
+        count = self._counts(values)
+        return _moments(count[:, _regular(count, np.ones(_PIXELS, np.bool_))])
 
     def moment_covariance(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Covariance of `moments` from sample to sample of the simulated pixels."""
         count = self._counts(values)
-        group = np.arange(_PIXELS) % GROUPS
+        count = count[:, _regular(count, np.ones(_PIXELS, np.bool_))]
+        group = np.arange(count.shape[1]) % GROUPS
         parts = np.array([_moments(count[:, group == k]) for k in range(GROUPS)])
         return np.asarray(np.cov(parts.T)) / GROUPS
 
