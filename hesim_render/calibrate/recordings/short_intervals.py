@@ -27,6 +27,8 @@ _UNEVEN = 0.02
 #: A density whose logarithm falls by more than this within the counts after the edge is not known there; chance of a
 #: count that is too large for the density.
 _FALLS, _CHANCE = 0.25, 1e-4
+#: Steps from 0 to the edge, over the counts that are read about it, from which these bound a step whose density falls.
+_FEW_STEPS = 8
 #: Windows that must be equally full, and part of all windows of the same recording above which it is saturated.
 _LEAST_WINDOWS, _SATURATED = 20, 0.1
 #: Fullest windows differ by no more than this part, and than this part of what chance makes of as many events: those
@@ -67,10 +69,13 @@ def dead_time(tallies: Sequence[EventTally]) -> dict[str, Any]:
     margin = max(2, int(np.ceil(_OF_STEP / each)), end - edge + 1)
     place, error, most = _place(counts, edge, margin, part)
     if counts[edge : edge + margin + 1].max() > stats.poisson.isf(_CHANCE / margin, most):
-        return not_identifiable(
-            f"the density of the intervals falls at once after its step at {edge * clock_us} µs: its course within the "
-            f"clock's steps of {clock_us} µs is not known"
-        )
+        if edge < _FEW_STEPS * margin or begin < edge - margin:
+            return not_identifiable(
+                f"the density of the intervals falls at once after its step at {edge * clock_us} µs: its course within "
+                f"the clock's steps of {clock_us} µs is not known"
+            )
+        # a course that is not known moves a sharp step by no more than the counts that are read about it
+        place, error = float(edge), margin / Z_95
     place, error = place * clock_us, error * clock_us
     low, high = place - Z_95 * error, place + Z_95 * error
     if end - begin > 2 * wide:
