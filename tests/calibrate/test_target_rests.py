@@ -94,7 +94,7 @@ def test_pixels_that_see_less_of_the_target_and_parts_of_cycles_do_not_count():
     assert one.seconds == pytest.approx(9 / hz, rel=0.003) and one.counts.sum() < 0.97 * events.size
     kept = target.seen_alike(one).reshape(shape)
     assert kept[:20].mean() > 0.9 and kept[20:].mean() < 0.1
-    found = target.thresholds(one, np.exp(rise), None)
+    found = target.thresholds(one, np.exp(rise), None, 0.0)
     for name, value, within in (
         ("theta_on", 0.21, 0.04),
         ("theta_off", 0.27, 0.04),

@@ -51,7 +51,7 @@ def test_a_worker_of_a_build_runs_none_and_has_the_package_of_its_parent(working
     plan = BenchmarkPlan(generated(1))
     order = order_of(plan.spec, Path("/nowhere")).replace(hesim_render.__version__, "9.9.9")
     with pytest.raises(OutputError, match=r"9\.9\.9"):
-        LocalWorkers(order, 1, 2).run(plan.clips, lambda answer: None)
+        LocalWorkers(order, 1).run(plan.clips, lambda answer: None)
     assert not working_folder.exists(), working_folder.read_text()
 
 
