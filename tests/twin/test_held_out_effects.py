@@ -127,9 +127,8 @@ def test_twins_of_unlike_sensors_pass(tmp_path, name):
     assert ("light of the long series" in named) == (name == "light that drifts")
 
 
-@pytest.mark.parametrize(
-    "factor", [pytest.param(f, marks=() if f == 1.0 else pytest.mark.slow) for f in (0.9, 1.0, 1.15)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.9, 1.0, 1.15])
 def test_where_rounding_hides_the_dark_noise_grey_values_tell_it(tmp_path, monkeypatch, factor):
     """A dark noise of 0.22 DN at 8 bit: 9 statistics in the light, and the noise by the chances of grey values.
 

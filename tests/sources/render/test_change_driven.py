@@ -103,7 +103,7 @@ def test_a_crop_is_the_full_sensor(name):
     np.testing.assert_allclose(part, whole[:, :, 11:27, 7:31], rtol=1e-6)
 
 
-@pytest.mark.parametrize("reference", ["previous_sample", "last_event"])
+@pytest.mark.parametrize("reference", [pytest.param("previous_sample", marks=pytest.mark.slow), "last_event"])
 def test_a_run_goes_on_where_another_one_stopped(reference):
     """With another renderer, which has not seen what came before."""
     changes = NOISE if reference == "previous_sample" else {"evs.threshold_mismatch_rel": 0.02}
