@@ -76,7 +76,7 @@ def test_continuous_modulation_does_not_and_says_so(tmp_path):
     entry = next(one for one in found.entries if one.key == "bandwidth")
     assert entry.name == "ON" and not found.band.in_bursts
     assert entry.value["value"] is None or abs(entry.value["value"] - CORNER_HZ) > 0.15 * CORNER_HZ
-    assert any(one.startswith("bandwidth: the dead time of 2") and "860 Hz" in one for one in found.findings)
+    assert any(one.startswith("bandwidth: the dead time of 27") and "860 Hz" in one for one in found.findings)
 
 
 def slow_bench(folder, own, rng, *, swings=(1.6, 3.2), hz=7.0, dead_us=0.0, **content):
