@@ -1,7 +1,5 @@
 """Building a benchmark: plan, clips, manifest and card. A build that was stopped goes on where it was."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import time

@@ -5,8 +5,6 @@ What hubs of data sets read of a benchmark: metadata in Croissant 1.1 (JSON-LD),
 Neither has a date or a licence, which a benchmark does not know: who publishes it adds them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -1,7 +1,5 @@
 """One clip of a benchmark, built into a folder that appears whole or not at all."""
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Clips on the workers of a dask.distributed scheduler."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Random draws: a pure function of the benchmark's seed, the kind of draw, and the numbers of scene, motion, light."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from typing import TypeVar

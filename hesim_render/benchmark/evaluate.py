@@ -3,8 +3,6 @@
 A sentence says which method loses to doing nothing, in how many items, and why that happens.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Sequence
 from pathlib import Path

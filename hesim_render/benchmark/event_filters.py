@@ -1,7 +1,5 @@
 """Filters that keep events with neighbours and drop lone ones: baselines of event denoising."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

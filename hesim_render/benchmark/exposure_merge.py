@@ -1,7 +1,5 @@
 """High dynamic range from exposures of different lengths, and how flux over many decades is measured."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The folder of a benchmark: its plan, its clips, and the manifest of the finished whole."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass

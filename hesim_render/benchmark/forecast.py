@@ -1,7 +1,5 @@
 """Time and size of a build, estimated before it starts from a clip of each sensor."""
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path

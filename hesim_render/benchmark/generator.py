@@ -3,8 +3,6 @@
 The camera is 2 m before the plane z = 0, of which it sees 1 m across: lengths in m are lengths in widths of the view.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import dataclass

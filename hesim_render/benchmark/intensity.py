@@ -10,8 +10,6 @@ threshold: L(t) = L(f) · exp(c · E(f, t)). The blurred image is the mean of L 
 for every pixel. E is a step function of time: its mean is a sum over the events, without a loop over pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Lamps of generated scenes, with the illuminance that they give together at the middle of the view."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ pixel has the place that it has on the mosaic, so a sparse event grid gives spar
 The cumulative representation of events of EFNet.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Worker processes on this machine: they take units of work one by one, and a dead one is replaced."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import selectors

@@ -3,8 +3,6 @@
 Textures by seed: pictures of reflectance between two values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

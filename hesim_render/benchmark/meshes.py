@@ -1,7 +1,5 @@
 """Meshes by seed, as text of OBJ files, within a cube of side 1 about the origin."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -3,8 +3,6 @@
 The agreement of a stream of events with a true one is measured pixel by pixel: times, missed events, and still pixels.
 """
 
-from __future__ import annotations
-
 import importlib.util
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Trajectories of generated scenes: ways of solids and of the camera at a stated speed."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Baselines of optical flow, from two pictures and from events, and how flow is measured."""
 
-from __future__ import annotations
-
 import importlib.util
 from typing import Any
 

@@ -3,8 +3,6 @@
 Pictures are the light of a scene as numbered PNG files, with their time stamps.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Our sensor and other event simulators in the same light, compared with the events of noise-free pixels."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 import time

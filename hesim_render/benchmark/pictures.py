@@ -3,8 +3,6 @@
 Bilinear demosaicing of any tile, a baseline: each channel is a mean of its samples around, weighted by a tent.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The clips of a benchmark: every combination of its axes, each with a name, a split and its own settings."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Results of a user for the tasks of a benchmark: a folder of arrays or pictures, one file for each item."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 What a clip holds for training, as arrays: one sample for each frame, and each event in one of them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -6,8 +6,6 @@ A sensor reads one filter at each pixel, and none at a pixel for events alone. T
 is rendered once for each filter, by the same sensor with that filter on all pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -8,8 +8,6 @@ Its bytes are therefore those of a clip without spans, also where a span is miss
 Units of work of a build: clips, and spans of long clips, which come before them.
 """
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections import deque
@@ -107,7 +105,7 @@ class Unit:
         return self.clip.as_dict() | ({} if self.span is None else {"span": list(self.span)})
 
     @classmethod
-    def of(cls, fields: dict[str, Any]) -> Unit:
+    def of(cls, fields: dict[str, Any]) -> "Unit":
         """The unit with such fields (`as_dict`)."""
         span = fields.get("span")
         return cls(Clip(**{k: v for k, v in fields.items() if k != "span"}), None if span is None else tuple(span))

@@ -1,7 +1,5 @@
 """Figures of a clip by which clips differ: brightness, contrast, activity and speed."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Places that hold files by name: a folder, or whatever fsspec knows by its address (extra ``remote``)."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress

@@ -1,7 +1,5 @@
 """Tasks of a clip with their baselines: deblurring, interpolation, denoising, events, flow, intensity, colour."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 Neither tonic nor PyTorch is needed for it; a `DataLoader` of PyTorch takes it as well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal

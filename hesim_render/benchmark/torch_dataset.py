@@ -1,7 +1,5 @@
 """A benchmark as a `torch.utils.data.Dataset` (extra ``torch``)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """Verification of a benchmark by its hashes: nothing is missing, changed or added, and splits share no part."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ A worker of dask calls `attempt`. Errors travel as text, because exceptions with
 Which GPU a worker uses: each process on a machine takes one of its own, as long as there are enough.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import functools

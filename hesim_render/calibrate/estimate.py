@@ -3,8 +3,6 @@
 A finding is a sign that captures do not follow the model, in one line that says what to look at.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

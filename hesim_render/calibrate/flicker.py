@@ -3,8 +3,6 @@
 A trial is a comparison of a sensor with fixed ticks, or the time after a reset of an asynchronous sensor.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2

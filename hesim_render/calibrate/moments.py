@@ -1,7 +1,5 @@
 """Mean and variance over repeated frames, per pixel and exposure, in one pass over the stream."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path

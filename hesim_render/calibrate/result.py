@@ -1,7 +1,5 @@
 """``calibration.yaml``, its map files and the place of its report. A file is written completely or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

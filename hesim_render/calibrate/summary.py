@@ -1,7 +1,5 @@
 """The main parameters of a calibration in a few lines of text."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

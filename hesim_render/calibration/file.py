@@ -1,7 +1,5 @@
 """Reading ``calibration.yaml`` and its files of maps."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The maps that a sensor takes from the calibration that its file names."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -8,8 +8,6 @@ states (`tick_us`, `frame_rate_hz`), else with that of the sensor file that name
 tell. Each of them knows the names of its maps in the file.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import ClassVar, Self

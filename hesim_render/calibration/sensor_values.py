@@ -1,7 +1,5 @@
 """A sensor file's own noise, replaced by that of a calibration."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

@@ -4,8 +4,6 @@
 a later calibration reads. Sections hold further keys for human readers.
 """
 
-from __future__ import annotations
-
 import math
 from enum import IntEnum
 from typing import Annotated, Any, Literal
@@ -60,7 +58,7 @@ class EstimateSpec(_Section):
     note: str = ""
 
     @model_validator(mode="after")
-    def _check(self) -> EstimateSpec:
+    def _check(self) -> "EstimateSpec":
         if self.value is None and self.reason is None:
             raise ValueError("value: null needs a reason beside it")
         return self
@@ -258,7 +256,7 @@ class CalibrationSpec(Strict):
         return value
 
     @model_validator(mode="after")
-    def _check(self) -> CalibrationSpec:
+    def _check(self) -> "CalibrationSpec":
         tile = self.capture.tile_rows, self.capture.tile_cols
         for name in ("beta", "goodness.chi2_per_dof"):
             if self.aps is None:

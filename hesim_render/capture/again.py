@@ -1,7 +1,5 @@
 """A recording made again from its manifest alone."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -7,8 +7,6 @@ transmittance.
 What a session should find are the sensor's own values, by the names that calibrations give them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

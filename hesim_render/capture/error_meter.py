@@ -7,8 +7,6 @@ half the difference of a value's two halves is distributed as its error. The lim
 the values are off by more than `TOLERANCE` wanted errors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

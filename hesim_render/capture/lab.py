@@ -4,8 +4,6 @@ Frames and events come from the same noise models and the same event stage as in
 is that of `hesim_render.capture.bench`.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

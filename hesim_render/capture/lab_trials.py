@@ -4,8 +4,6 @@ The events are those of the event stage: a trial is a stage of its own, whose fi
 pixel, as the end of a reset does. The light is uniform.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

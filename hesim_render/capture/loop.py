@@ -1,7 +1,5 @@
 """The capture loop: from a source of flux and a sensor to frames, events and their truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from itertools import tee
 

@@ -1,7 +1,5 @@
 """Frames during their exposure: exposed piece by piece, then read out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush

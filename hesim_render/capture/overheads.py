@@ -1,7 +1,5 @@
 """Estimated time of what a run does besides its rays: kernels, windows, noise of event pixels, frames, the audit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from hesim_render.core.units import S_PER_US

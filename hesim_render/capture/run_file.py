@@ -1,7 +1,5 @@
 """A whole run from one file: a recording, then pictures, exports and its page. A run that was ended goes on."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """How a scene is simulated: the settings of a run, checked, and the sensor's noise with terms switched off by name."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypedDict

@@ -1,7 +1,5 @@
 """The renderer that a run asks for, or that its scene needs."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hesim_render.sensor.sensor import Sensor

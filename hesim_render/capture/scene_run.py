@@ -1,7 +1,5 @@
 """The run of a scene, step by step: estimate, capture, verdict on the render, geometric truth."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from functools import cached_property

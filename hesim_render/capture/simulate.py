@@ -1,7 +1,5 @@
 """Render a scene, expose a sensor to it, and record frames and events."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Simulate a sensor in front of a hyperspectral cube, still or moving."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal

@@ -4,8 +4,6 @@ What a run has given so far, and its state then, go into a journal: an interrupt
 again for what has passed.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext

@@ -1,7 +1,5 @@
 """Benchmarks: ``benchmark build``, ``verify``, ``evaluate``, ``export`` and ``peers``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -89,7 +87,7 @@ def build(
 
 
 def _estimated(
-    console: Console, expected: BuildEstimate, progress: ProgressReport, workers: int, is_wanted: bool
+    console: Console, expected: "BuildEstimate", progress: "ProgressReport", workers: int, is_wanted: bool
 ) -> None:
     """Print the estimate; refuse a long build that nobody has wanted."""
     console.estimated(progress)(expected)

@@ -1,7 +1,5 @@
 """Captures and calibrations: ``calibrate lab``, ``aps``, ``evs``, ``recording`` and ``twin``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """All commands together, in the order of the help."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Annotated, Any
 

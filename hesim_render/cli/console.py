@@ -1,7 +1,5 @@
 """What a command prints: text for people, one JSON object for programs, or nothing (``--json``, ``--quiet``)."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -109,7 +107,7 @@ def facts_of(expected: object) -> dict[str, Any]:
     return {"text": str(expected), **fields}
 
 
-def recording_facts(recording: Recording) -> dict[str, Any]:
+def recording_facts(recording: "Recording") -> dict[str, Any]:
     """A recording for programs: its place, origin, region, counts, times and the error that its render has reached."""
     manifest = recording.manifest
     scene = manifest.get("scene") or {}

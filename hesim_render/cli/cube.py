@@ -1,7 +1,5 @@
 """Spectral cubes of scenes: ``cube``."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

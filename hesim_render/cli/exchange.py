@@ -1,7 +1,5 @@
 """Files of other programs: ``export`` and ``import``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -3,8 +3,6 @@
 Ctrl-C ends a run within two seconds, also in native code that does not return to Python.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
@@ -54,7 +52,7 @@ class Interrupts:
         self.happened = True
         raise KeyboardInterrupt
 
-    def __enter__(self) -> Interrupts:
+    def __enter__(self) -> "Interrupts":
         self._reading, self._writing = os.pipe()
         os.set_blocking(self._writing, False)
         self._wakeup_before = signal.set_wakeup_fd(self._writing, warn_on_full_buffer=False)

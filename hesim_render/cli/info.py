@@ -1,7 +1,5 @@
 """What there is (``info``): the machine, names to be used, figures of a sensor; and files to begin with (``new``)."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """What `simulate` is given: a scene, a video, a hyperspectral cube, a run file, or a recording to be made again."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Collection, Mapping
@@ -41,12 +39,12 @@ class Inputs:
     roi: str | None = None
     allow_outside: bool = False
 
-    def load_scene(self) -> Scene:
+    def load_scene(self) -> "Scene":
         import hesim_render as hr
 
         return hr.load_scene(self.name, self.keys, allow_outside=self.allow_outside)
 
-    def load_sensor(self) -> Sensor:
+    def load_sensor(self) -> "Sensor":
         import hesim_render as hr
 
         return cropped(hr.load_sensor(self.sensor, self.sensor_keys), self.roi)

@@ -1,7 +1,5 @@
 """Measuring on recordings: ``measure``, ``compare`` for two recordings of events, and the test report (``report``)."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated

@@ -3,8 +3,6 @@
 Names of options in errors that the Python API raised with the names of its arguments.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -133,7 +131,7 @@ def sensor_keys_only(scene_changes: dict[str, object], example: str) -> None:
         raise RangeError("--set", key, f"a key of the sensor file, as {example}")
 
 
-def cropped(sensor: Sensor, roi: str | None) -> Sensor:
+def cropped(sensor: "Sensor", roi: str | None) -> "Sensor":
     """The sensor with the region of ``--roi``."""
     return sensor if roi is None else sensor.crop(*parse_roi(roi))
 

@@ -1,7 +1,5 @@
 """Pictures in place of a recording: the framing of a scene, and what moves in it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from hesim_render.cli.console import Console

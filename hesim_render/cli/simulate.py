@@ -1,7 +1,5 @@
 """Recordings: ``simulate`` of a scene, video, cube, run file or recording, and ``demo``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -176,7 +174,7 @@ def _given(**options: Any) -> dict[str, Any]:
 
 
 def show_recording(
-    console: Console, recording: Recording, more: str = "", facts: Mapping[str, Any] | None = None
+    console: Console, recording: "Recording", more: str = "", facts: Mapping[str, Any] | None = None
 ) -> None:
     """The result of a run: its recording, with the status that the audit gives."""
     from hesim_render.recording.quality import is_short_of_wish
@@ -186,7 +184,7 @@ def show_recording(
     console.result(summary(recording) + more, {**recording_facts(recording), **(facts or {})}, status)
 
 
-def _scene(console: Console, inputs: Inputs, out: Path, overwrite: bool = False, **options: Any) -> Recording:
+def _scene(console: Console, inputs: Inputs, out: Path, overwrite: bool = False, **options: Any) -> "Recording":
     """The recording of a scene."""
     check_output(out, overwrite)
     with console.stop_at_estimate(), console.progress(f"{inputs.name} → {inputs.sensor}") as progress:

@@ -1,7 +1,5 @@
 """Comparisons of filter sets, designs of filters, and sweeps: ``study``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

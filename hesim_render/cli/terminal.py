@@ -1,7 +1,5 @@
 """Terminal input and output of commands: parsing of values, lines of text, a summary."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re
@@ -80,7 +78,7 @@ def complain(*lines: str) -> None:
             _silence(sys.stderr)
 
 
-def summary(recording: Recording) -> str:
+def summary(recording: "Recording") -> str:
     """Content and place of a recording, in a few lines."""
     from hesim_render.recording.outline import scene_name
     from hesim_render.recording.quality import render_lines

@@ -1,7 +1,5 @@
 """Recordings as pictures and pages: ``isp`` and ``view``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

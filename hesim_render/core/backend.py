@@ -11,8 +11,6 @@ Dr.Jit loads its LLVM the moment it is imported, so `hesim_render` prepares the 
 imported itself (`prepare`). The verdict on a library is cached by path, size and modification time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import ctypes.util

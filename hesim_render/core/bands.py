@@ -1,7 +1,5 @@
 """Bands of rows on all cores: NumPy releases Python's lock in its loops, and a band stays in the cache."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

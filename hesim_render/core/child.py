@@ -1,7 +1,5 @@
 """Child processes of Python, which run the package of their parent, and interrupts that wait."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

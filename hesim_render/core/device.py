@@ -3,8 +3,6 @@
 It is loaded where a function first uses it, not where a module is imported: it takes an LLVM and looks for GPUs then.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 from hesim_render.core.child import interrupts_held

@@ -11,8 +11,6 @@ A `Namespace` has the array functions that a formula may use, so that one implem
 `device_namespace()`, the calibration with `NUMPY`, for which neither Dr.Jit nor Mitsuba needs to be installed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """Distinct values of the large arrays of a full sensor, for which NumPy's `unique` takes seconds."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

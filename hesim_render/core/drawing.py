@@ -4,8 +4,6 @@ Matplotlib is imported when a report is drawn, not before. Figures are built wit
 the process changes and no display is needed.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -53,14 +51,14 @@ def report_style() -> Iterator[None]:
         yield
 
 
-def new_figure(size_px: tuple[int, int]) -> Figure:
+def new_figure(size_px: tuple[int, int]) -> "Figure":
     """An empty figure of `size_px` (width, height) whose parts are laid out so that texts do not overlap."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(size_px[0] / _PER_INCH, size_px[1] / _PER_INCH), layout="constrained")
 
 
-def panel(title: str, x_label: str, y_label: str, size_px: tuple[int, int] = (420, 290)) -> tuple[Figure, Axes]:
+def panel(title: str, x_label: str, y_label: str, size_px: tuple[int, int] = (420, 290)) -> "tuple[Figure, Axes]":
     """A figure with one pair of axes, size in px of the page."""
     figure = new_figure(size_px)
     axes = figure.subplots()
@@ -68,7 +66,7 @@ def panel(title: str, x_label: str, y_label: str, size_px: tuple[int, int] = (42
     return figure, axes
 
 
-def points(axes: Axes, x: NDArray, y: NDArray, colour: str, label: str = "", size: float = 3.4) -> None:
+def points(axes: "Axes", x: NDArray, y: NDArray, colour: str, label: str = "", size: float = 3.4) -> None:
     """Draw one dot per pair of numbers, half transparent where many overlap.
 
     Parameters
@@ -81,7 +79,7 @@ def points(axes: Axes, x: NDArray, y: NDArray, colour: str, label: str = "", siz
     axes.plot(x, y, linestyle="none", marker="o", markersize=size, color=colour, alpha=0.55, label=label)
 
 
-def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
+def legend_below(figure: "Figure", axes: "Axes", columns: int) -> None:
     """Legend of the labelled artists below the axes, where it covers nothing; the figure grows by its height.
 
     Parameters
@@ -128,7 +126,7 @@ def picture(title: str, values: NDArray, unit: str, size_px: int = 400) -> Marku
     return svg(figure)
 
 
-def svg(figure: Figure) -> Markup:
+def svg(figure: "Figure") -> Markup:
     """The figure as an SVG element for an HTML page, without prologue, metadata, date or styles of its own.
 
     The element needs no other file. Call this function within `report_style`, as all drawing functions.

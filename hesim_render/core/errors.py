@@ -4,8 +4,6 @@ The command line prints the message of a `HesimError` on one line and exits with
 Any other exception that escapes is a bug of this package and keeps its traceback.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, requires
@@ -56,7 +54,7 @@ class SpecError(HesimError, ValueError):
     problems : all errors of the file, if there are several; `file`, `line` and `key` belong to the first.
     """
 
-    problems: tuple[SpecError, ...] = ()
+    problems: "tuple[SpecError, ...]" = ()
 
     def __init__(
         self,
@@ -74,7 +72,7 @@ class SpecError(HesimError, ValueError):
         super().__init__(": ".join([*parts, message]))
 
     @classmethod
-    def together(cls, problems: Sequence[SpecError]) -> SpecError:
+    def together(cls, problems: "Sequence[SpecError]") -> "SpecError":
         """One error for all problems of a file, one per line; a single problem is returned unchanged."""
         if len(problems) == 1:
             return problems[0]

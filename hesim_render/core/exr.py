@@ -1,7 +1,5 @@
 """EXR files of others: their size is looked at before they are read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -4,8 +4,6 @@ A damaged or malicious file causes one clear error. It cannot name files outside
 memory than there is.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

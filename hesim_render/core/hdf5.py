@@ -1,7 +1,5 @@
 """HDF5 files: writing that survives a full disk, and data sets of untrusted files."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import mmap

@@ -1,7 +1,5 @@
 """Memory of the host that NumPy has freed stays with the process."""
 
-from __future__ import annotations
-
 import ctypes
 import sys
 

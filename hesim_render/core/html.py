@@ -1,7 +1,5 @@
 """HTML from the templates that lie beside the modules that fill them; whatever is filled in is escaped."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Sequence
@@ -20,7 +18,7 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 @cache
-def _environment() -> Environment:
+def _environment() -> "Environment":
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     return Environment(

@@ -5,8 +5,6 @@ each with the hash of what it was calculated from, its length and a checksum. An
 the process is dropped, and so is all that follows it.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import json
@@ -248,7 +246,7 @@ class Journal:
             self._file.flush()
             self._places[key] = self.path, begin, len(data), checksum
 
-    def __enter__(self) -> Journal:
+    def __enter__(self) -> "Journal":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:

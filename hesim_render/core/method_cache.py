@@ -1,7 +1,5 @@
 """Results of a method, remembered without a cycle of references."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 from typing import ParamSpec, TypeVar, cast

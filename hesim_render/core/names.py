@@ -1,7 +1,5 @@
 """Names that become files or folders: one checked type for all names that come from files of others."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -3,8 +3,6 @@
 The header of an array is checked before its data are read, and no more data are read than it states.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import struct
@@ -65,7 +63,7 @@ class NpzWriter:
         if written != int(np.prod(shape)):
             raise RangeError(f"values of {name}", written, f"{int(np.prod(shape))}, for the shape {shape}")
 
-    def __enter__(self) -> NpzWriter:
+    def __enter__(self) -> "NpzWriter":
         return self
 
     def __exit__(self, *_: object) -> None:

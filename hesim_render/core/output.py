@@ -1,7 +1,5 @@
 """Output folders and files that appear whole or not at all."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import ctypes
@@ -316,7 +314,7 @@ class OutputFolder:
     def discard(self) -> None:
         _remove(self.path)
 
-    def __enter__(self) -> OutputFolder:
+    def __enter__(self) -> "OutputFolder":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

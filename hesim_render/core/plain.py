@@ -3,8 +3,6 @@
 Plain values, NumPy arrays and types of Dr.Jit arrays become bytes and come back; nothing in the bytes is ever executed.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Progress of a run: a bar on a terminal or in a notebook, occasional lines anywhere else."""
 
-from __future__ import annotations
-
 import contextlib
 import html
 import sys
@@ -175,7 +173,7 @@ class ProgressReport:
             self._view.say(note)
         self._view.show(self.pace)
 
-    def __enter__(self) -> ProgressReport:
+    def __enter__(self) -> "ProgressReport":
         self._thread.start()
         return self
 

@@ -1,7 +1,5 @@
 """The part of a sensor that is read out, as text."""
 
-from __future__ import annotations
-
 import re
 
 from hesim_render.core.errors import RangeError

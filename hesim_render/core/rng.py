@@ -5,8 +5,6 @@ seed and the stream, the counters are the pixel's index on the *full* sensor, th
 Nothing depends on chunking, threads, crops or the order of calls.
 """
 
-from __future__ import annotations
-
 import math
 from enum import IntEnum
 from typing import Any

@@ -1,7 +1,5 @@
 """Names of the files that ship with the package, found without loading what reads them."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Tables that kernels read, copied so that their place in memory does not make Dr.Jit compile kernels again."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Physical constants (CODATA through SciPy) and the few unit conversions that cross modules."""
 
-from __future__ import annotations
-
 from scipy import constants
 
 PLANCK_J_S: float = constants.h

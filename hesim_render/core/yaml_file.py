@@ -1,7 +1,5 @@
 """YAML files: read without trust in their size, depth or aliases, and written."""
 
-from __future__ import annotations
-
 import functools
 import pickle
 from pathlib import Path

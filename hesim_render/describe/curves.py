@@ -1,7 +1,5 @@
 """Curves of a sensor by the closed forms of its model: events against light and contrast, photon transfer."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

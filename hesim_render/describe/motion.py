@@ -1,7 +1,5 @@
 """The motion of a scene in a sensor's picture: trails, density of events, and what a recording of it would hold."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,7 +49,7 @@ def write_motion(look: MotionLook, sensor: Sensor, t_us: float, path: Path) -> N
         figure.savefig(unfinished, format="png", metadata={"Software": None}, dpi=100)
 
 
-def _trails(look: MotionLook, sensor: Sensor, t_us: float, figure: Figure, axes: Axes) -> None:
+def _trails(look: MotionLook, sensor: Sensor, t_us: float, figure: "Figure", axes: "Axes") -> None:
     from matplotlib.collections import LineCollection
 
     rows, cols = sensor.layout.shape
@@ -73,7 +71,7 @@ def _trails(look: MotionLook, sensor: Sensor, t_us: float, figure: Figure, axes:
     axes.grid(visible=False)
 
 
-def _density(look: MotionLook, sensor: Sensor, figure: Figure, axes: Axes) -> None:
+def _density(look: MotionLook, sensor: Sensor, figure: "Figure", axes: "Axes") -> None:
     from matplotlib.colors import LogNorm
 
     assert look.events is not None
@@ -89,7 +87,7 @@ def _density(look: MotionLook, sensor: Sensor, figure: Figure, axes: Axes) -> No
     _bar(figure, axes, image, "events per pixel and second; none: light grey")
 
 
-def _bar(figure: Figure, axes: Axes, drawn: ScalarMappable, label: str) -> None:
+def _bar(figure: "Figure", axes: "Axes", drawn: "ScalarMappable", label: str) -> None:
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     bar = figure.colorbar(drawn, cax=axes.inset_axes((1.02, 0, 0.035, 1)), label=label)

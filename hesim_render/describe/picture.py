@@ -1,7 +1,5 @@
 """The curves of a sensor as one picture."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -69,7 +67,7 @@ def write_picture(sensor: Sensor, file: Path) -> None:
             figure.savefig(unfinished, format=kind, dpi=144)
 
 
-def _spectra(sensor: Sensor, axes: Axes) -> None:
+def _spectra(sensor: Sensor, axes: "Axes") -> None:
     axes.set(title="Spectral response", xlabel="wavelength, nm", ylabel="electrons per photon on the pixel")
     quantum_efficiency = sensor.spec.quantum_efficiency.load()
     for k, (name, filter_) in enumerate(sensor.spec.filters.items()):
@@ -81,13 +79,13 @@ def _spectra(sensor: Sensor, axes: Axes) -> None:
     axes.legend(frameon=False)
 
 
-def _against_light(axes: Axes, title: str, unit: str) -> None:
+def _against_light(axes: "Axes", title: str, unit: str) -> None:
     axes.set(title=title, xlabel="illuminance on the sensor, lx", ylabel=unit, xscale="log", yscale="log")
     axes.set_xlim(_LUX[0] / 2, 2 * _LUX[-1])
     axes.set_xticks(_LUX_TICKS)
 
 
-def _noise(sensor: Sensor, axes: Axes) -> None:
+def _noise(sensor: Sensor, axes: "Axes") -> None:
     _against_light(axes, "Noise of ln x", "standard deviation")
     curves = event_curves(sensor, _LUX)
     if np.any(curves.sigma > 0):
@@ -100,7 +98,7 @@ def _noise(sensor: Sensor, axes: Axes) -> None:
     axes.legend(frameon=False)
 
 
-def _rates(sensor: Sensor, axes: Axes) -> None:
+def _rates(sensor: Sensor, axes: "Axes") -> None:
     _against_light(axes, "Events in steady light", "events per s and pixel")
     curves = event_curves(sensor, _LUX)
     for rate, colour, label in (
@@ -120,7 +118,7 @@ def _rates(sensor: Sensor, axes: Axes) -> None:
     axes.legend(frameon=False)
 
 
-def _latency(sensor: Sensor, axes: Axes) -> None:
+def _latency(sensor: Sensor, axes: "Axes") -> None:
     _against_light(axes, "Latency of an ON event, without noise", "µs")
     sheet = sensor.evs.spec.data_sheet
     stated = 1.0 if sheet is None else 0.01 * sheet.speed_step_percent
@@ -138,7 +136,7 @@ def _latency(sensor: Sensor, axes: Axes) -> None:
     axes.legend(frameon=False)
 
 
-def _s_curves(sensor: Sensor, axes: Axes) -> None:
+def _s_curves(sensor: Sensor, axes: "Axes") -> None:
     axes.set(title="S-curves, one comparison after a step", xlabel="contrast (L₁ − L₀)/L₀, %",
              ylabel="probability of an event")  # fmt: skip
     widest = 4 * max(sensor.evs.spec.contrast_threshold_on, sensor.evs.spec.contrast_threshold_off)
@@ -149,7 +147,7 @@ def _s_curves(sensor: Sensor, axes: Axes) -> None:
     axes.legend(frameon=False)
 
 
-def _transfer(sensor: Sensor, axes: Axes) -> None:
+def _transfer(sensor: Sensor, axes: "Axes") -> None:
     axes.set(title="Photon transfer", xlabel="mean above black, DN", ylabel="temporal noise, DN", xscale="log",
              yscale="log")  # fmt: skip
     electrons, mean, deviation = photon_transfer(sensor)

@@ -1,7 +1,5 @@
 """The figures of a sensor as a table: what the file says, and what its model makes of it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 Checks of event arrays and of intervals of time.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

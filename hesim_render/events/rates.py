@@ -1,7 +1,5 @@
 """Events per second over time."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -8,8 +8,6 @@ NumPy writes and reads it without a library for FlatBuffers.
 Reader of tables in FlatBuffers (flatbuffers.dev), with every position checked.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterator
@@ -46,7 +44,7 @@ class FlatTable:
         self._fields = [self._at(fields + at, "<H") for at in range(4, size - 1, 2)]
 
     @classmethod
-    def root(cls, data: bytes, identifier: bytes) -> FlatTable:
+    def root(cls, data: bytes, identifier: bytes) -> "FlatTable":
         """The root table of a buffer without a size in front, which must have an identifier of 4 bytes."""
         if data[4:8] != identifier:
             raise ValueError(f"a part says {data[4:8]!r}; expected {identifier!r}")

@@ -3,8 +3,6 @@
 An event is its time in µs (32 bits), then x (bits 13 to 0), y (27 to 14) and polarity (28, 1 is ON).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO

@@ -4,8 +4,6 @@ Text: ``width height`` on the first line, then ``t x y p`` for each event, t in 
 Arrays: ``t`` int64 µs, ``x`` and ``y`` uint16, ``p`` uint8, and ``width`` and ``height``.
 """
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path

@@ -12,8 +12,6 @@
 Written from the description that Prophesee's own codec is (Apache-2.0). The writer packs rows, columns and polarities together.
 """  # noqa: E501
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ A packet holds the words of EVT3 as bytes. A decoder keeps its state from packet
 packet with time and row, so that a reader can start with any.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from pathlib import Path

@@ -5,8 +5,6 @@ above its lowest 6 bits in 28 bits, which start again after 2³⁴ µs. EXT_TRIG
 line in bits 12 to 8, and 1 in bit 0 where the edge rises.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO

@@ -13,8 +13,6 @@ A word is left out where it would repeat the one before. The writer uses no vect
 and would change the order of events whose time is the same.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO

@@ -5,8 +5,6 @@ RAW frames as files of other programs: 16-bit TIFF and PNG, NPY, and the ``.bin`
 All hold the exact DN. The challenge's files are uint16, little endian: width, height, then the pixels row by row.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

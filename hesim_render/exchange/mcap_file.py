@@ -5,8 +5,6 @@ nanoseconds (32 bits) and polarity (8 bits), so that the events after the first 
 and reads a packet as one array. The container is that of the package mcap.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The container of MCAP files, read part by part by means of the package mcap."""
 
-from __future__ import annotations
-
 import io
 import zlib
 from collections.abc import Iterator

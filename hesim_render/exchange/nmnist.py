@@ -3,8 +3,6 @@
 x; y; polarity in bit 7 and the upper 7 bits of the time; the middle and the lower 8 bits of the time, in µs.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import IO
 

@@ -5,8 +5,6 @@ the edges of trigger lines in the same form, not packed. No HDF5 plugin is neede
 `ecf`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any

@@ -4,8 +4,6 @@ Lines ``% key value`` state format and size of the sensor; ``% end`` closes them
 the header also ends before the first line that does not begin with ``% ``.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A stream of events: blocks in order of time, with the size of the event grid."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +49,7 @@ class EventStream:
     triggers: Callable[[], NDArray] = no_triggers
 
     @classmethod
-    def of(cls, events: NDArray, shape: tuple[int, int], source: str | Path = "events") -> EventStream:
+    def of(cls, events: NDArray, shape: tuple[int, int], source: str | Path = "events") -> "EventStream":
         """The stream of an array.
 
         Parameters

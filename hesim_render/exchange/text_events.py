@@ -1,7 +1,5 @@
 """Events of lists as text, a line for each event, in the forms of `text_form`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from decimal import Decimal
 from pathlib import Path

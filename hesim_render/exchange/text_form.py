@@ -6,8 +6,6 @@ ones are microseconds, unless the header names the unit. Polarity is 1 for ON, a
 state ``width height``, or a comment the geometry.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

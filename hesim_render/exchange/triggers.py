@@ -1,7 +1,5 @@
 """Edges of trigger lines among the events of a file: the times of exposures, in the clock of the events."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 

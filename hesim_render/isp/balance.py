@@ -1,7 +1,5 @@
 """White balance: one gain per channel, so that white is equal in all."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Patches of a colour chart in an image, and their reference colours."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -8,8 +8,6 @@ uses thresholds; the second is a Wiener filter that uses the result of the first
 whole blocks, so that equal colours are compared, and the basis serves any tile, also with holes.
 """
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Colour correction: a matrix from the camera's channels to linear sRGB, fitted to a chart and judged in ΔE2000."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -7,8 +7,6 @@ slope. All steps work on the square root of the signal, where the noise is unifo
 about black, so that a dark frame keeps its mean.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterable, Sequence
 

@@ -8,8 +8,6 @@ of their own with less noise.
 Pictures in RGB have a smoothing that preserves edges, the guided filter, and a noise reduction based on it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

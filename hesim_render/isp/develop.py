@@ -1,7 +1,5 @@
 """Pictures of all frames of a recording, in a folder that appears whole or not at all."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -5,8 +5,6 @@ diagonals. A pair (a "bridge") has the larger weight the smaller its difference 
 across an edge.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

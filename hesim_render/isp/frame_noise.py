@@ -1,7 +1,5 @@
 """Noise model of a sensor's frames for the ISP: variance against signal, and fixed maps."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -63,7 +61,7 @@ class FrameNoise:
     @classmethod
     def of_sensor(
         cls, spec: SensorSpec, layout: Layout, off: frozenset[str] = frozenset(), maps: bool = True
-    ) -> FrameNoise:
+    ) -> "FrameNoise":
         """Noise of a sensor file's frame pixels.
 
         Parameters
@@ -113,7 +111,7 @@ class FrameNoise:
     @classmethod
     def of_recording(
         cls, manifest: Mapping[str, Any], calibration: str | Path | None = None, folder: Path | None = None
-    ) -> FrameNoise:
+    ) -> "FrameNoise":
         """Noise of the sensor that made a recording, without the terms that were switched off there.
 
         Parameters
@@ -143,7 +141,7 @@ class FrameNoise:
         return cls.of_sensor(spec, layout, off, known)
 
     @classmethod
-    def of_calibration(cls, file: str | Path, exposure_us: float) -> FrameNoise:
+    def of_calibration(cls, file: str | Path, exposure_us: float) -> "FrameNoise":
         """Noise of frames of a real sensor, from ``calibrate aps``, for the captured region.
 
         Parameters
@@ -174,7 +172,7 @@ class FrameNoise:
             offset_dn=offset.astype(np.float32), dark_dn_per_s=dark.astype(np.float32),
         )  # fmt: skip
 
-    def at(self, exposure_us: float) -> FrameNoise:
+    def at(self, exposure_us: float) -> "FrameNoise":
         """The noise of the same sensor at another exposure.
 
         Parameters
@@ -187,7 +185,7 @@ class FrameNoise:
         """
         return replace(self, exposure_us=float(exposure_us))
 
-    def times(self, factor: float) -> FrameNoise:
+    def times(self, factor: float) -> "FrameNoise":
         """The same noise with all standard deviations multiplied by a factor; the maps are unchanged.
 
         Parameters

@@ -7,8 +7,6 @@ weights by local likelihood. A grating at half the Nyquist frequency, for exampl
 detail and the other as colour, becomes detail.
 """
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -9,8 +9,6 @@ data and works for any tile, also with holes.
 A stencil is an array of weights [output, input position in the block, block row - 1 … + 1, block col - 1 … + 1].
 """
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass, replace
 
@@ -227,7 +225,7 @@ class Taps:
     matrix: NDArray[np.float32]
 
     @classmethod
-    def of(cls, weights: NDArray[np.float32]) -> Taps:
+    def of(cls, weights: NDArray[np.float32]) -> "Taps":
         reads = np.argwhere(np.abs(weights).max(axis=0) > 0)
         return cls(tuple((int(p), int(y), int(x)) for p, y, x in reads), np.ascontiguousarray(weights[:, *reads.T]))
 

@@ -1,7 +1,5 @@
 """From DN to light: black level and lens shading."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

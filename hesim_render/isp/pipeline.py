@@ -1,7 +1,5 @@
 """A pipeline: a list of steps that a YAML file can change, and the functions that run it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -40,7 +38,7 @@ class Pipeline(Strict):
     steps: list[Step] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _in_order(self) -> Pipeline:
+    def _in_order(self) -> "Pipeline":
         names = [item.step for item in self.steps]
         if names.count("demosaic") != 1:
             raise ValueError("steps: exactly one of them must be demosaic")
@@ -60,7 +58,7 @@ class Pipeline(Strict):
         return self
 
     @classmethod
-    def of(cls, *steps: str | dict[str, Any]) -> Pipeline:
+    def of(cls, *steps: str | dict[str, Any]) -> "Pipeline":
         """A pipeline of given steps.
 
         Parameters
@@ -73,7 +71,7 @@ class Pipeline(Strict):
         """
         return cls.model_validate({"steps": [{"step": item} if isinstance(item, str) else item for item in steps]})
 
-    def without(self, step: str) -> Pipeline:
+    def without(self, step: str) -> "Pipeline":
         """The same pipeline without some of its steps.
 
         Parameters

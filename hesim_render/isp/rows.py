@@ -6,8 +6,6 @@ neighbours. Offsets with a known spread are then the most likely ones that expla
 system with a Gaussian prior).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@ noise.
 A mosaic as planes, one for each position of a block of whole tiles. Each plane has one colour and one noise.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The steps of a pipeline file: one model per step, which calls the step's function."""
 
-from __future__ import annotations
-
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Exposure and tone curves, on linear RGB. Hues are kept, because all channels of a pixel get one factor."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -7,8 +7,6 @@ stream, at most in 95 of 100 cases. A difference below that is none that these r
 Statistics of a stream of events, each for successive parts of its time, so that they can be drawn anew.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain

@@ -1,7 +1,5 @@
 """Measures of pictures against a truth. Range, window and border of each are stated."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -14,8 +14,6 @@ The edge is not found row by row from centroids, but as the straight line of the
 once. This works on any subset of pixels, such as those of one filter of a mosaic.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal

@@ -3,8 +3,6 @@
 channel = (matrix⁻¹ · linear RGB) / white balance        DN = black + channel · (white - black)
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +52,7 @@ class Camera(Strict):
         return [line.split() for line in given.splitlines() if line.strip()] if isinstance(given, str) else given
 
     @model_validator(mode="after")
-    def _consistent(self) -> Camera:
+    def _consistent(self) -> "Camera":
         count = len(self.channels)
         if len(set(self.channels)) != count or NO_VALUE in self.channels:
             raise ValueError(f"channels: names must differ, and {NO_VALUE!r} is not a name")
@@ -78,7 +76,7 @@ class Camera(Strict):
         return self
 
     @classmethod
-    def of(cls, mosaic: Mosaic) -> Camera:
+    def of(cls, mosaic: Mosaic) -> "Camera":
         """The camera that the mosaic of a recording describes. Balance and matrix are those for the light of the scene.
 
         Parameters

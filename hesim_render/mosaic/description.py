@@ -4,8 +4,6 @@ A `Mosaic` is plain data. The manifest of a recording contains it, so that a rec
 shown and exported without the sensor file it was made with.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -66,7 +64,7 @@ class Mosaic(BaseModel):
     noise_profile: tuple[PositiveFloat, PositiveFloat] | None = None
 
     @model_validator(mode="after")
-    def _consistent(self) -> Mosaic:
+    def _consistent(self) -> "Mosaic":
         tables: list[list[list[Any]]] = [self.tile_filter, self.tile_aps, self.tile_evs]
         if not all(map(_is_even, tables)) or len({np.shape(table) for table in tables}) != 1:
             raise ValueError("tile_filter: it, tile_aps and tile_evs must be tables of one size, of at least one pixel")
@@ -134,7 +132,7 @@ def cfa_code(response: Spectrum) -> int:
     return _CODES["".join(name for name in "RGB" if means[name] >= 0.5 * largest)] if largest > 0 else 6
 
 
-def describe(sensor: Sensor, light: Spectrum | None = None) -> Mosaic:
+def describe(sensor: "Sensor", light: Spectrum | None = None) -> Mosaic:
     """The mosaic of a sensor under a light (relative spectral power; default D65)."""
     spec = sensor.spec
     rows = spec.tile_rows

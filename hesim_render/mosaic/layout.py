@@ -1,7 +1,5 @@
 """Positions of pixels: the tile over the read-out region, its filters, roles and event grid."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -38,11 +36,11 @@ class Layout(PlainState):
         return f"<Layout {self.spec.name!r}: {self.cols}x{self.rows}+{self.col0}+{self.row0} px>"
 
     @classmethod
-    def full(cls, spec: SensorSpec, maps: MeasuredMaps | None = None) -> Layout:
+    def full(cls, spec: SensorSpec, maps: MeasuredMaps | None = None) -> "Layout":
         """The whole sensor."""
         return cls(spec, 0, 0, spec.geometry.rows, spec.geometry.cols, maps)
 
-    def crop(self, width_px: int, height_px: int, x: int | None = None, y: int | None = None) -> Layout:
+    def crop(self, width_px: int, height_px: int, x: int | None = None, y: int | None = None) -> "Layout":
         """A region of this region, in whole tiles; centred where `x`, `y` are not given.
 
         Parameters

@@ -1,7 +1,5 @@
 """Times of row exposures and of event comparisons, in µs from the start."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 

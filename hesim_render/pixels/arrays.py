@@ -3,8 +3,6 @@
 Noise terms that can be switched off by name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any, TypeAlias
 

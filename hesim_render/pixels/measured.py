@@ -1,7 +1,5 @@
 """Measured maps of the calibration named in a sensor file, cut to the region that is read out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import TypeVar
 

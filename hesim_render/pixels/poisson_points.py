@@ -5,8 +5,6 @@ not change a process without memory. The points of any stretch of time are there
 do not depend on the start of a run, on how it is split or on how often it is asked.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -6,8 +6,6 @@ what ``labels`` of the scene file says, else its name without the number at its 
 class ``car``). An object whose label is null has no boxes.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Cameras and targets in the calibration files of OpenCV and Kalibr."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

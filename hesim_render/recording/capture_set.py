@@ -3,8 +3,6 @@
 Frames are decompressed one at a time, so a capture set larger than memory can be calibrated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +52,7 @@ class CaptureSet:
             return self.sensor.aps.frame_rate_hz
         return self.spec.frame_rate_hz
 
-    def frames(self, name: Literal["aps_dark", "aps_lit"]) -> FrameStack:
+    def frames(self, name: Literal["aps_dark", "aps_lit"]) -> "FrameStack":
         """The stack of frames in ``<name>.npz``, not yet read.
 
         Raises

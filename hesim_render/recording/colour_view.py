@@ -1,7 +1,5 @@
 """Colours of previews: raw frames and events as pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -8,8 +8,6 @@ TIFF/EP (ISO 12234-2).
 The noise of a sensor's frames in the two numbers that DNG has for it (tag NoiseProfile).
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging
@@ -292,7 +290,7 @@ def _rationals(values: NDArray[np.float64]) -> tuple[int, ...]:
 _SIGNALS = 65
 
 
-def noise_profile(sensor: Sensor, without: Sequence[str] = ()) -> tuple[float, float] | None:
+def noise_profile(sensor: "Sensor", without: Sequence[str] = ()) -> tuple[float, float] | None:
     """S and O of the temporal variance S·x + O of a pixel, where x is 0 at the black level and 1 at the white level.
 
     The law of the frame noise is fitted by least squares, each signal relative to its own variance, so that dark and

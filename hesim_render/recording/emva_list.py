@@ -14,8 +14,6 @@ too: separators, decimal commas, units behind the exposure, comments, encodings,
 wrote the list.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Recordings and event files in the formats of other programs."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

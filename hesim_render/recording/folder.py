@@ -1,7 +1,5 @@
 """Writer of a recording's folder."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -146,7 +144,7 @@ class FolderWriter:
         self._finished = True
         return target
 
-    def __enter__(self) -> FolderWriter:
+    def __enter__(self) -> "FolderWriter":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

@@ -3,8 +3,6 @@
 Frames of a recording on disk.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -113,8 +111,8 @@ class StoredFrames(Sequence[Frame]):
     @overload
     def __getitem__(self, index: int) -> Frame: ...
     @overload
-    def __getitem__(self, index: slice) -> StoredFrames: ...
-    def __getitem__(self, index: int | slice) -> Frame | StoredFrames:
+    def __getitem__(self, index: slice) -> "StoredFrames": ...
+    def __getitem__(self, index: int | slice) -> "Frame | StoredFrames":
         if isinstance(index, slice):
             return StoredFrames(self._folder, self._entries[index], self._shape)
         entry = dict(self._entries[index])

@@ -1,7 +1,5 @@
 """The scene of a recording, made again from its manifest: geometric truth at any time."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

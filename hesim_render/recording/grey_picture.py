@@ -1,7 +1,5 @@
 """Grey pictures with the values of an ADC in them: PNG, TIFF, BMP and PGM of 8 or 16 bits."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Captures of real sensors as recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 

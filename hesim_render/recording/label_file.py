@@ -2,8 +2,6 @@
 object that each event's pixel shows.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Callable

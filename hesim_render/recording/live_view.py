@@ -1,7 +1,5 @@
 """A run in the viewer rerun while it goes on, or in a file that grows."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``recording.json``: specifications, seed, versions and units of a recording; written, read and checked."""
 
-from __future__ import annotations
-
 import json
 import platform
 from collections.abc import Mapping
@@ -50,7 +48,7 @@ MASKS = {
 
 
 def build(
-    sensor: Sensor,
+    sensor: "Sensor",
     *,
     scene: BaseModel | None,
     seed: int,

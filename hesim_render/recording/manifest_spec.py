@@ -1,7 +1,5 @@
 """The model of ``recording.json``; a manifest is validated before any part of it is used."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any, Literal
@@ -49,7 +47,7 @@ class _AuditedPart(_OpenSection):
     extra_at_most: float | None = None
 
     @model_validator(mode="after")
-    def _check(self) -> _AuditedPart:
+    def _check(self) -> "_AuditedPart":
         shares = (self.missed, self.missed_at_most, self.extra, self.extra_at_most)
         if (self.true_events or self.found_events) and any(share is None for share in shares):
             raise ValueError("true_events, found_events: need missed, extra and their _at_most beside them")
@@ -66,7 +64,7 @@ class _Audit(_OpenSection):
     frames: _AuditedPart | None = None
 
     @model_validator(mode="after")
-    def _check(self) -> _Audit:
+    def _check(self) -> "_Audit":
         reasons = self.quality_needed, self.samples_needed, self.short_of_rays
         if self.verdict == "not met" and all(reason is None for reason in reasons):
             raise ValueError(
@@ -98,7 +96,7 @@ class _Time(Strict):
     end_us: int = Field(ge=0, le=_LATEST_US)
 
     @model_validator(mode="after")
-    def _check(self) -> _Time:
+    def _check(self) -> "_Time":
         if self.end_us < self.begin_us:
             raise ValueError("end_us: lies before begin_us")
         return self
@@ -157,7 +155,7 @@ class _Counts(Strict):
     events_dropped: NonNegativeInt = 0
 
     @model_validator(mode="after")
-    def _check(self) -> _Counts:
+    def _check(self) -> "_Counts":
         if self.events != self.events_on + self.events_off:
             raise ValueError("events: must be events_on and events_off together")
         return self
@@ -193,7 +191,7 @@ class RecordingSpec(Strict):
     masks: dict[str, str]
 
     @model_validator(mode="after")
-    def _check(self) -> RecordingSpec:
+    def _check(self) -> "RecordingSpec":
         if self.counts.frames != len(self.frames):
             raise ValueError(f"counts.frames: is {self.counts.frames}, but frames lists {len(self.frames)}")
         if (self.event_grid.width == 0) != (self.event_grid.height == 0):

@@ -1,7 +1,5 @@
 """A recording as a video for people: the colour view, the events, or the events over the colour view."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a recording holds, in short: as pairs of names and texts, as a line, and as tables for notebooks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +17,7 @@ if TYPE_CHECKING:
 _THUMBNAIL_PX = 480
 
 
-def parameters(recording: Recorded) -> list[tuple[str, str]]:
+def parameters(recording: "Recorded") -> list[tuple[str, str]]:
     """What a recording holds, as pairs of a name and a text."""
     manifest = recording.manifest
     roi, grid, counts = manifest["roi"], manifest["event_grid"], manifest["counts"]
@@ -41,7 +39,7 @@ def parameters(recording: Recorded) -> list[tuple[str, str]]:
     return [(name, printable(text)) for name, text in rows]
 
 
-def scene_name(recording: Recorded) -> str:
+def scene_name(recording: "Recorded") -> str:
     """Name of the scene, or of the file that stands for it: a video, a cube, or the first one of a capture."""
     settings, scene = recording.manifest["settings"], recording.manifest.get("scene")
     if "video" in settings:
@@ -54,7 +52,7 @@ def scene_name(recording: Recorded) -> str:
     return str((scene or {}).get("name", "no scene file"))
 
 
-def text_summary(recording: Recorded) -> str:
+def text_summary(recording: "Recorded") -> str:
     """`Recording.__repr__`."""
     counts, roi, grid = (recording.manifest[key] for key in ("counts", "roi", "event_grid"))
     parts = [f"{recording.duration_us / US_PER_S:g} s"]

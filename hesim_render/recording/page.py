@@ -3,8 +3,6 @@
 Plots of a recording: its pictures, events over time, and the distribution of RAW values.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from pathlib import Path
@@ -34,7 +32,7 @@ _PANEL_PX = (460, 320)
 _TINTS = {"red": "#d62728", "green": "#2ca02c", "blue": "#1f77b4"}
 
 
-def figure_of(recording: Recorded) -> Figure:
+def figure_of(recording: Recorded) -> "Figure":
     """`Recording.plot`."""
     draws: list[Callable[[Recorded, Axes], None]] = []
     pictures = middle_views(recording)
@@ -61,7 +59,7 @@ def figure_of(recording: Recorded) -> Figure:
     return figure
 
 
-def draw_rates(recording: Recorded, axes: Axes) -> None:
+def draw_rates(recording: Recorded, axes: "Axes") -> None:
     """ON and OFF events per second over the recording; from disk, one interval at a time is read."""
     time = recording.manifest["time"]
     evs = recording.manifest["sensor"]["spec"].get("evs") or {}
@@ -83,7 +81,7 @@ def draw_rates(recording: Recorded, axes: Axes) -> None:
     axes.legend(frameon=False)
 
 
-def draw_histogram(recording: Recorded, axes: Axes) -> None:
+def draw_histogram(recording: Recorded, axes: "Axes") -> None:
     """RAW values of the middle frame, of each filter."""
     frame, mosaic = recording.frames[len(recording.frames) // 2], recording.mosaic
     channel = mosaic.tiled(mosaic.tile_channel, frame.raw.shape)

@@ -4,8 +4,6 @@ Two layouts are read: that of the standard's own data sets (``EMVA1288_Data.txt`
 plain folder whose file names state light and exposure (``lit_5160us_15508ph_01.png``). Frames are read one at a time.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -75,18 +73,18 @@ class PairSet:
         """Whether dark frames of one exposure stand for those of all, so that dark current counts as light."""
         return any(not _same(lit.exposure_s, dark.exposure_s) for lit, dark in zip(self.lit, self.dark, strict=True))
 
-    def with_long_at(self, light: float) -> PairSet:
+    def with_long_at(self, light: float) -> "PairSet":
         """The set with that long series which is nearest to some light, in photons or else in s of exposure."""
         if len(self.long) < 2:
             return self
         lit, dark = min(self.long, key=lambda both: abs(light_of_series(both[0], self.has_photons) - light))
         return replace(self, spatial_lit=lit, spatial_dark=dark)
 
-    def with_long_of(self, other: PairSet) -> PairSet:
+    def with_long_of(self, other: "PairSet") -> "PairSet":
         """The set with the long series of the light that another set of the same list uses."""
         return self.with_long_at(light_of_series(other.spatial_lit, other.has_photons))
 
-    def half(self, number: int) -> PairSet:
+    def half(self, number: int) -> "PairSet":
         """Every second exposure and every second frame of the long series, from the first (0) or the second (1) on."""
         cut = slice(number, None, 2)
 

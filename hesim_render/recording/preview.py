@@ -1,7 +1,5 @@
 """Pictures of a recording for display: the RAW mosaic, events over a frame, and sheets of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

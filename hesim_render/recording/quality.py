@@ -1,7 +1,5 @@
 """How good a recording is, in words: its stated error, and what its audit found."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -12,8 +12,6 @@ On disk (docs/formats.md)::
 Frames are written as they come and read back one at a time: a long recording is never in memory.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -52,8 +50,8 @@ class Recorded:
         events: NDArray | None = None,
         event_truth: EventTruth | None = None,
         path: Path | None = None,
-        labels: EventLabels | None = None,
-        scene: Scene | None = None,
+        labels: "EventLabels | None" = None,
+        scene: "Scene | None" = None,
     ) -> None:
         self.frames, self.manifest, self.path, self.scene = frames, manifest, path, scene
         self._events, self._event_truth, self._labels = events, event_truth, labels
@@ -101,7 +99,7 @@ class Recorded:
         return self._event_truth
 
     @property
-    def event_labels(self) -> EventLabels | None:
+    def event_labels(self) -> "EventLabels | None":
         """What caused each event, lost events and the events without noise; None where the run was not asked for them.
 
         Raises
@@ -176,7 +174,7 @@ class Recorded:
         return result
 
     @cached_property
-    def truth(self) -> SceneTruth:
+    def truth(self) -> "SceneTruth":
         """Geometric truth at any time: depth, flow, poses and more, computed from the scene when it is asked for.
 
         Raises
@@ -186,7 +184,7 @@ class Recorded:
         """
         return self._geometry(self.scene)
 
-    def truth_with(self, scene: Scene) -> SceneTruth:
+    def truth_with(self, scene: "Scene") -> "SceneTruth":
         """Geometric truth at any time, for a scene that needs files besides its own.
 
         Parameters
@@ -204,13 +202,13 @@ class Recorded:
         """
         return self._geometry(scene)
 
-    def _geometry(self, scene: Scene | None) -> SceneTruth:
+    def _geometry(self, scene: "Scene | None") -> "SceneTruth":
         from hesim_render.recording.geometry import geometry_of
 
         return geometry_of(self.manifest, self.path, scene)
 
     @cached_property
-    def stored_truth(self) -> StoredTruth | None:
+    def stored_truth(self) -> "StoredTruth | None":
         """Geometric truth that the run has written; None where it was not asked for, or the recording is in memory."""
         from hesim_render.recording.truth_file import TRUTH_FILE, StoredTruth
 

@@ -4,8 +4,6 @@ The content is in `recorded`. The methods here call functions over it; what draw
 call.
 """
 
-from __future__ import annotations
-
 import contextlib
 import warnings
 from pathlib import Path
@@ -64,7 +62,7 @@ class Recording(Recorded):
 
         return html_summary(self)
 
-    def plot(self) -> Figure:
+    def plot(self) -> "Figure":
         """Draw the middle frame, the events around it, the event rates over time, and the histogram of RAW values.
 
         Returns

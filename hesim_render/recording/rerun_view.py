@@ -6,8 +6,6 @@ themselves) at the end of each frame, ``truth/electrons`` and, where they were w
 ``world/objects/…``.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -4,8 +4,6 @@ RAW developers know 2×2 patterns of three colours. A quad mosaic is binned into
 of four colours say, becomes linear sRGB with a pixel for each tile.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -3,8 +3,6 @@
 Every format is a folder with ``export.json``, which states what was written. docs/ground-truth.md has the conventions.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Callable

@@ -5,8 +5,6 @@ docs/ground-truth.md lists the data sets with their units. Images are chunked by
 Kinds of ground truth that a run can be asked for.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,7 +82,7 @@ class TruthRequest:
     seed: int
 
     @classmethod
-    def of(cls, manifest: Mapping[str, Any]) -> TruthRequest:
+    def of(cls, manifest: Mapping[str, Any]) -> "TruthRequest":
         """What a run was asked for, by its manifest."""
         wanted = manifest["settings"].get("truth") or {"kinds": ()}
         rows = np.arange(manifest["roi"]["height_px"], dtype=np.float64)
@@ -111,7 +109,7 @@ class TruthRequest:
 
 
 def write_truth(
-    path: Path, truth: SceneTruth, request: TruthRequest, progress: Callable[[int, int], None] | None = None
+    path: Path, truth: "SceneTruth", request: TruthRequest, progress: Callable[[int, int], None] | None = None
 ) -> None:
     """Write the file.
 
@@ -143,7 +141,7 @@ def write_truth(
         _write_series(file, truth, request)
 
 
-def _write_constants(file: Any, truth: SceneTruth) -> None:
+def _write_constants(file: Any, truth: "SceneTruth") -> None:
     names = truth.names
     for kind in ("objects", "instances", "materials"):
         file[f"names/{kind}"] = np.array([name.encode() for name in getattr(names, kind)])
@@ -157,7 +155,7 @@ def _write_constants(file: Any, truth: SceneTruth) -> None:
 
 
 def _write_images(
-    group: Any, truth: SceneTruth, grid: Any, kinds: Sequence[str], rows: NDArray[np.float64], number: int
+    group: Any, truth: "SceneTruth", grid: Any, kinds: Sequence[str], rows: NDArray[np.float64], number: int
 ) -> None:
     """All images of one time, as entry `number` of their data sets.
 
@@ -185,7 +183,7 @@ def _write_images(
 
 
 def images_at(
-    truth: SceneTruth, grid: Any, kinds: Sequence[str], rows: NDArray[np.float64], number: int
+    truth: "SceneTruth", grid: Any, kinds: Sequence[str], rows: NDArray[np.float64], number: int
 ) -> list[tuple[str, NDArray]]:
     """Names and values of the images of one time; rows without a next or a previous time have no flow there.
 
@@ -220,7 +218,7 @@ def images_at(
     return arrays
 
 
-def _write_series(file: Any, truth: SceneTruth, request: TruthRequest) -> None:
+def _write_series(file: Any, truth: "SceneTruth", request: TruthRequest) -> None:
     if "poses" in request.kinds or "light" in request.kinds:
         times = np.arange(0, request.end_us + 1, POSE_STEP_US, dtype=np.float64)
     if "poses" in request.kinds:

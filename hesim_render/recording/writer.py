@@ -1,7 +1,5 @@
 """Writer of a run's frames and events, into a folder or into memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,7 +51,7 @@ class RecordingWriter:
     def __init__(
         self,
         path: str | Path | None,
-        sensor: Sensor,
+        sensor: "Sensor",
         *,
         scene: Any = None,
         seed: int,
@@ -144,7 +142,7 @@ class RecordingWriter:
         else:
             self._labels.append(block)
 
-    def write_event_objects(self, truth: SceneTruth) -> None:
+    def write_event_objects(self, truth: "SceneTruth") -> None:
         """Have the object that each event's pixel shows written at the end; nothing in memory, where
         `Recording.event_objects` computes it.
 
@@ -166,7 +164,7 @@ class RecordingWriter:
         for manifest in (self._manifest, *([self._folder.manifest] if self._folder is not None else [])):
             manifest["settings"] = {**manifest["settings"], **settings}
 
-    def write_truth(self, truth: SceneTruth, progress: Callable[[int, int], None] | None = None) -> None:
+    def write_truth(self, truth: "SceneTruth", progress: Callable[[int, int], None] | None = None) -> None:
         """Write the geometric truth that the settings ask for, after the last frame; nothing in memory, where
         `Recording.truth` computes it.
 
@@ -205,7 +203,7 @@ class RecordingWriter:
             self._live.close(is_whole)
             self._live = None
 
-    def __enter__(self) -> RecordingWriter:
+    def __enter__(self) -> "RecordingWriter":
         return self
 
     def __exit__(self, *error: Any) -> None:

@@ -1,7 +1,5 @@
 """Recordings of event pixels on a bench, opened: what the estimators of the report read."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path

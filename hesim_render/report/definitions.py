@@ -1,7 +1,5 @@
 """What each figure of the report means: one sentence, its formula, and how it is measured."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

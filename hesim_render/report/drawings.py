@@ -1,7 +1,5 @@
 """Drawings of the report: each takes axes, so that the page and the PDF have the same."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -54,7 +52,7 @@ def frame_drawings(figures: FrameFigures) -> list[Draw]:
     ]
 
 
-def _logarithmic(axes: Axes, *which: str) -> None:
+def _logarithmic(axes: "Axes", *which: str) -> None:
     """Logarithmic axes, with numbers between the powers of ten where there are few of those."""
     from matplotlib.ticker import LogLocator
 
@@ -70,7 +68,7 @@ def _logarithmic(axes: Axes, *which: str) -> None:
             axis.set_minor_formatter("")
 
 
-def _s_curves(axes: Axes, figures: EventFigures) -> None:
+def _s_curves(axes: "Axes", figures: EventFigures) -> None:
     pair = figures.curves[0]
     axes.set(title=f"S-curves at {pair[0].lux:g} lx", xlabel="step, ln L₁/L₀", ylabel="share of steps answered")
     for curve, name, colour in zip(pair, POLARITIES, _ON_OFF, strict=True):
@@ -82,7 +80,7 @@ def _s_curves(axes: Axes, figures: EventFigures) -> None:
     axes.legend(frameon=False)
 
 
-def _bars(axes: Axes, lux: list[float], values: list[dict], colour: str, label: str, line: str = "-") -> None:
+def _bars(axes: "Axes", lux: list[float], values: list[dict], colour: str, label: str, line: str = "-") -> None:
     """Values with their intervals; those that are not known, or 0, are left out."""
     some = [(x, v) for x, v in zip(lux, values, strict=True) if v["value"] and "interval_95" in v]
     if some:
@@ -102,7 +100,7 @@ def _bars(axes: Axes, lux: list[float], values: list[dict], colour: str, label: 
         )
 
 
-def _latency(axes: Axes, figures: EventFigures) -> None:
+def _latency(axes: "Axes", figures: EventFigures) -> None:
     contrast = figures.latencies[0][0].contrast
     axes.set(title=f"Latency and jitter, contrast {100 * contrast:.3g} %", xlabel="illuminance, lx", ylabel="µs")
     for every, name, colour in zip(figures.latencies, POLARITIES, _ON_OFF, strict=True):
@@ -113,12 +111,12 @@ def _latency(axes: Axes, figures: EventFigures) -> None:
     _legend(axes)
 
 
-def _legend(axes: Axes) -> None:
+def _legend(axes: "Axes") -> None:
     if axes.get_legend_handles_labels()[1]:
         axes.legend(frameon=False)
 
 
-def _detected(axes: Axes, figures: EventFigures) -> None:
+def _detected(axes: "Axes", figures: EventFigures) -> None:
     axes.set(
         title="Steps of 2θ that are found", xlabel="illuminance, lx", ylabel="share, less chance", ylim=(-0.05, 1.05)
     )
@@ -132,7 +130,7 @@ def _detected(axes: Axes, figures: EventFigures) -> None:
     _legend(axes)
 
 
-def _background(axes: Axes, figures: EventFigures) -> None:
+def _background(axes: "Axes", figures: EventFigures) -> None:
     axes.set(title="Background", xlabel="illuminance, lx", ylabel="events per s and pixel")
     stated = sorted({one.temperature_c for one in figures.backgrounds if one.temperature_c is not None})
     each: list[float | None] = [*stated] or [None]
@@ -145,7 +143,7 @@ def _background(axes: Axes, figures: EventFigures) -> None:
     _legend(axes)
 
 
-def _band(axes: Axes, figures: EventFigures) -> None:
+def _band(axes: "Axes", figures: EventFigures) -> None:
     band = figures.band
     assert band is not None
     name = "bursts" if band.in_bursts else "cycles"
@@ -163,7 +161,7 @@ def _band(axes: Axes, figures: EventFigures) -> None:
     _logarithmic(axes, "x", "y")
 
 
-def _intervals(axes: Axes, figures: EventFigures) -> None:
+def _intervals(axes: "Axes", figures: EventFigures) -> None:
     axes.set(title="Intervals of a pixel", xlabel="interval, µs", ylabel="number per µs")
     counts = figures.intervals[:-1]
     edges = np.unique(np.round(np.geomspace(1, _LONGEST_INTERVAL_US, 60)).astype(int))
@@ -184,7 +182,7 @@ def _levels(figures: FrameFigures) -> tuple[NDArray[np.float64], NDArray[np.floa
     return light_of(result.pairs, result.lit), result.signal, result.lit.variance - result.dark.variance, unit
 
 
-def _transfer(axes: Axes, figures: FrameFigures) -> None:
+def _transfer(axes: "Axes", figures: FrameFigures) -> None:
     _, signal, variance, _ = _levels(figures)
     axes.set(title="Photon transfer", xlabel="signal above the dark, DN", ylabel="variance above the dark, DN²")
     points(axes, signal, variance, COLOURS[0], "pairs", 4.2)
@@ -194,7 +192,7 @@ def _transfer(axes: Axes, figures: FrameFigures) -> None:
     axes.legend(frameon=False, loc="upper left")
 
 
-def _linearity(axes: Axes, figures: FrameFigures) -> None:
+def _linearity(axes: "Axes", figures: FrameFigures) -> None:
     light, signal, _, unit = _levels(figures)
     axes.set(title="Signal", xlabel=unit, ylabel="signal above the dark, DN")
     points(axes, light, signal, COLOURS[0], "pairs", 4.2)
@@ -206,7 +204,7 @@ def _linearity(axes: Axes, figures: FrameFigures) -> None:
     axes.legend(frameon=False, loc="upper left")
 
 
-def _snr(axes: Axes, figures: FrameFigures) -> None:
+def _snr(axes: "Axes", figures: FrameFigures) -> None:
     light, signal, _, unit = _levels(figures)
     snr = signal / np.sqrt(np.maximum(figures.result.lit.variance, 1e-12))
     some = (signal > 0) & figures.result.clear

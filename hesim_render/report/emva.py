@@ -1,7 +1,5 @@
 """EMVA 1288 figures of frames, from the standard's captures [emva2021]."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

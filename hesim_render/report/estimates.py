@@ -1,7 +1,5 @@
 """Intervals of quantiles and shares over pixels and jumps, and places where a share is crossed."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

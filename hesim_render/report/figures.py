@@ -1,7 +1,5 @@
 """All figures of event pixels from the recordings of a bench."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Latency and jitter of event pixels, and the share of steps that they find, against light."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

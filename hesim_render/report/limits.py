@@ -1,7 +1,5 @@
 """The dynamic range of event pixels: the lowest and the highest light at which steps of two thresholds are found."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

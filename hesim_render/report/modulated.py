@@ -1,7 +1,5 @@
 """Bandwidth of event pixels, and thresholds from counts of events, both in modulated light."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

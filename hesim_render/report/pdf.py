@@ -1,7 +1,5 @@
 """The report as a PDF of A4 pages, drawn by matplotlib."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -39,7 +37,7 @@ class Document:
         self._y = 0.0
         self.count = 0
 
-    def _page(self) -> Figure:
+    def _page(self) -> "Figure":
         if self._figure is None:
             from matplotlib.figure import Figure
 

@@ -1,7 +1,5 @@
 """A test report of a sensor: HTML, PDF and JSON from captures, which are simulated where a sensor is given."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass

@@ -6,8 +6,6 @@ with standard deviation τ. θ, σ, τ, q are those of the largest likelihood of
 follow from the scatter of the pixels' scores, so that they hold where the law of the thresholds is another one.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -144,7 +142,7 @@ def _natural(values: NDArray[np.float64]) -> tuple[float, float, float, float]:
 
 
 def _part(
-    fit: _Fit,
+    fit: "_Fit",
     values: NDArray[np.float64],
     covariance: NDArray[np.float64],
     slope: NDArray[np.float64],

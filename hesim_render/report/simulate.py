@@ -1,7 +1,5 @@
 """Captures of a simulated sensor: recordings of its event pixels and EMVA 1288 captures of its frame pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -4,8 +4,6 @@ It chooses lights, contrasts and times from the nominal figures of the sensor an
 recordings are files; the estimators read nothing else.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path

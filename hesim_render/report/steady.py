@@ -1,7 +1,5 @@
 """Background rate of event pixels against light and temperature, from recordings of steady light."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tables of the report, as texts: the same for the page and the PDF."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 from hesim_render.report.definitions import EVENTS, FRAMES, Definition

@@ -4,8 +4,6 @@ A direction is the pair of tangents (x, y) of its angles to the axis; an image p
 Both point to the right and downwards, as in OpenCV.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -100,7 +98,7 @@ class Distortion:
     farthest: float
 
     @classmethod
-    def of(cls, spec: OpenCvDistortion | FisheyeDistortion, farthest: float) -> Distortion:
+    def of(cls, spec: OpenCvDistortion | FisheyeDistortion, farthest: float) -> "Distortion":
         """The distortion that a sensor file states; `farthest` as in `Distortion`."""
         if isinstance(spec, FisheyeDistortion):
             return cls("fisheye", spec.coefficients, farthest)

@@ -11,8 +11,6 @@ lux of a pixel, k = 1/F and t_ref = 1 s. With L that signal and L₀ the illumin
 σ follows from the background activity by `hesim_render.pixels.evs.noise_rates`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -84,7 +82,7 @@ class Figures:
     own_hz: float = 0.0
 
     @classmethod
-    def of_data_sheet(cls, sheet: DataSheetSpec, own_hz: float) -> Figures:
+    def of_data_sheet(cls, sheet: DataSheetSpec, own_hz: float) -> "Figures":
         """Figures of a data sheet. A latency is that of an ON event; the corner is that of the light after the step."""
         for stated in sheet.background:
             if stated.rate_hz <= sheet.leak_hz + own_hz:
@@ -113,7 +111,7 @@ class Figures:
         )  # fmt: skip
 
     @classmethod
-    def of_v2e(cls, options: V2eSpec) -> Figures:
+    def of_v2e(cls, options: V2eSpec) -> "Figures":
         """Figures of v2e's options. Its cut-off and its logarithm follow the light and 20 of its grey levels."""
         thresholds = options.pos_thres, options.neg_thres
         rate, white = options.shot_noise_rate_hz, options.white_lux

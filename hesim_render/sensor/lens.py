@@ -1,7 +1,5 @@
 """The lens and the pixel aperture: from radiance in the scene to photo-electrons per second."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import inf, pi
@@ -45,7 +43,7 @@ class Lens:
         focal_length_mm: float | None = None,
         focus_distance_m: float | None = None,
         off: Iterable[str] = (),
-    ) -> Lens:
+    ) -> "Lens":
         """The lens of a sensor file, with a scene's own f-number, focal length and focus distance.
 
         A thin lens focused at distance d from its entrance pupil has |m| = f / (d − f).

@@ -1,7 +1,5 @@
 """Eq. 1 for any radiance cube: electrons from spectral radiance, without a renderer."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

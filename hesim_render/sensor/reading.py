@@ -3,8 +3,6 @@
 Doubts are values that can be simulated, but that no sensor has: probably a wrong unit or a missing digit.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """A sensor ready to use: its specification, read-out region, lens and both noise models."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -62,7 +60,7 @@ class Sensor(PlainState):
     file: str = field(default="", compare=False)
 
     @classmethod
-    def from_spec(cls, spec: SensorSpec, file: str = "", maps: MeasuredMaps | None = None) -> Sensor:
+    def from_spec(cls, spec: SensorSpec, file: str = "", maps: MeasuredMaps | None = None) -> "Sensor":
         """The whole sensor that a specification describes, with its own lens.
 
         Parameters
@@ -111,7 +109,7 @@ class Sensor(PlainState):
         """Columns of the read-out region, px."""
         return self.layout.cols
 
-    def crop(self, width_px: int, height_px: int, x: int | None = None, y: int | None = None) -> Sensor:
+    def crop(self, width_px: int, height_px: int, x: int | None = None, y: int | None = None) -> "Sensor":
         """The same sensor with a smaller read-out region (width first, as in 512x384).
 
         The region always starts at a whole tile. Device maps and random numbers belong to the full sensor's pixels,
@@ -133,7 +131,7 @@ class Sensor(PlainState):
         """
         return replace(self, layout=self.layout.crop(width_px, height_px, x, y))
 
-    def with_lens(self, **changes: float | None) -> Sensor:
+    def with_lens(self, **changes: float | None) -> "Sensor":
         """The same sensor with another lens.
 
         Parameters
@@ -146,7 +144,7 @@ class Sensor(PlainState):
         """
         return replace(self, lens=Lens.of(self.spec, **changes, off=self.lens.off))
 
-    def without(self, terms: Iterable[str]) -> Sensor:
+    def without(self, terms: Iterable[str]) -> "Sensor":
         """The same sensor with effects of its lens switched off.
 
         Parameters
@@ -161,7 +159,7 @@ class Sensor(PlainState):
         return replace(self, lens=replace(self.lens, off=self.lens.off | off)) if off else self
 
     @property
-    def calibrated_part(self) -> Sensor:
+    def calibrated_part(self) -> "Sensor":
         """The sensor over the region that its calibration has measured; itself where there is no calibration."""
         return replace(self, layout=measured_part(self.layout))
 

@@ -1,7 +1,5 @@
 """A sensor file to begin with: round numbers with comments that say what to put there, or those of a shipped one."""
 
-from __future__ import annotations
-
 import re
 
 from hesim_render.core.shipped import data_folder

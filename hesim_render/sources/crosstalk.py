@@ -6,8 +6,6 @@ lost. At the border of the region, a pixel keeps the share of a missing neighbou
 counts for its own exposure, also with a rolling shutter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 import numpy as np

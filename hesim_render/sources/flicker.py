@@ -10,8 +10,6 @@ product of the means. Within a piece either the image hardly moves, or ln w depa
 less; in each cell of time (`schedule.CELL_US`) the kind with fewer pieces is used.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 

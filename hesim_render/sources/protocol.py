@@ -4,8 +4,6 @@ Every source implements `FluxSource`: renders, flickering light, crosstalk, vide
 know which one it uses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable

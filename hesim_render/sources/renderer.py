@@ -1,7 +1,5 @@
 """What a run asks of its source of flux, what it needs to know of it besides, and the estimate of what a run takes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -43,7 +41,7 @@ class Renderer(FluxSource, Protocol):
     def work(self) -> dict[str, float]:
         """Work done so far, for the manifest; empty where nothing is counted."""
 
-    def estimate(self, demand: Demand, progress: Progress | None = None) -> Estimate:
+    def estimate(self, demand: "Demand", progress: Progress | None = None) -> "Estimate":
         """Time and memory of a run. What is computed for it changes no value.
 
         Parameters
@@ -52,7 +50,7 @@ class Renderer(FluxSource, Protocol):
         progress : called with (done, total, what).
         """
 
-    def report(self, demand: Demand, expected: Estimate | None, progress: Progress) -> None:
+    def report(self, demand: "Demand", expected: "Estimate | None", progress: Progress) -> None:
         """Report the rays of what rests, which is one long render; nothing else is reported.
 
         Parameters
@@ -82,7 +80,7 @@ class Untraced:
         """See `Renderer.work`."""
         return {}
 
-    def report(self, demand: Demand, expected: Estimate | None, progress: Progress) -> None:
+    def report(self, demand: "Demand", expected: "Estimate | None", progress: Progress) -> None:
         """See `Renderer.report`: there is no long render."""
 
     def go_on(self, journal: Journal, part: int = 0) -> None:
@@ -130,7 +128,7 @@ class Estimate:
     held_bytes: float = 0.0
 
     @classmethod
-    def together(cls, parts: Sequence[Estimate]) -> Estimate:
+    def together(cls, parts: "Sequence[Estimate]") -> "Estimate":
         """Of a run whose light has several parts, each of which is asked for all of it."""
         return cls(
             seconds=sum(part.seconds for part in parts),

@@ -1,7 +1,5 @@
 """A scene ready to render: its validated file, or a Mitsuba scene given directly, and its parts by waveform."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,7 +85,7 @@ class Scene:
         waveforms: Mapping[str, Any] | None = None,
         name: str = "mitsuba",
         allow_outside: bool = False,
-    ) -> Scene:
+    ) -> "Scene":
         """A scene in Mitsuba's own format.
 
         Parameters

@@ -3,8 +3,6 @@
 Event samples of sources that compute one window after another.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise

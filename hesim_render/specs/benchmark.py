@@ -1,7 +1,5 @@
 """The specification of a benchmark: which clips are built, from which parts, for which sensors."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -59,7 +57,7 @@ class MaterialShares(Strict):
     glass: float = Field(0.0, ge=0, description="takes several times as long as the others")
 
     @model_validator(mode="after")
-    def _check(self) -> MaterialShares:
+    def _check(self) -> "MaterialShares":
         if sum(self.shares.values()) <= 0:
             raise ValueError("at least one material must have a share above 0")
         return self
@@ -135,7 +133,7 @@ class NoiseLevel(Strict):
     set: dict[str, Any] = Field({}, description="keys of the sensor file, such as aps.read_noise_e")
 
     @model_validator(mode="after")
-    def _check(self) -> NoiseLevel:
+    def _check(self) -> "NoiseLevel":
         if self.clean and (self.without or self.set):
             raise ValueError("clean has no noise at all: drop without and set")
         return self
@@ -156,7 +154,7 @@ class SharpSpec(Strict):
     )
 
     @model_validator(mode="after")
-    def _check(self) -> SharpSpec:
+    def _check(self) -> "SharpSpec":
         if (self.every_us is None) == (not self.times_us):
             raise ValueError("give every_us or times_us")
         if list(self.times_us) != sorted(set(self.times_us)):
@@ -184,7 +182,7 @@ class SplitShares(Strict):
     test: float = Field(0.15, ge=0, le=1)
 
     @model_validator(mode="after")
-    def _check(self) -> SplitShares:
+    def _check(self) -> "SplitShares":
         if abs(self.train + self.val + self.test - 1) > 1e-6:
             raise ValueError(f"train, val and test add up to {self.train + self.val + self.test:g}, not to 1")
         return self
@@ -223,7 +221,7 @@ class BenchmarkSpec(Strict):
     folder: Path = Field(Path(), exclude=True)
 
     @model_validator(mode="after")
-    def _check(self) -> BenchmarkSpec:
+    def _check(self) -> "BenchmarkSpec":
         if self.scenes.count == 0 and not self.scenes.given:
             raise ValueError("scenes: give a count above 0, or scenes of your own (given)")
         for choice in self.sensors:

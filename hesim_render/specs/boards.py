@@ -1,7 +1,5 @@
 """Targets of a scene file for geometric calibration."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import Literal
 
@@ -61,7 +59,7 @@ class CharucoTarget(_Board):
     first_id: int = Field(0, ge=0, le=100_000)
 
     @model_validator(mode="after")
-    def _inside(self) -> CharucoTarget:
+    def _inside(self) -> "CharucoTarget":
         if self.marker_m >= self.square_m:
             raise ValueError("marker_m must be below square_m")
         return self
@@ -107,7 +105,7 @@ class CircleGridTarget(_Board):
     asymmetric: bool = False
 
     @model_validator(mode="after")
-    def _apart(self) -> CircleGridTarget:
+    def _apart(self) -> "CircleGridTarget":
         if self.diameter_m >= self.pitch_m:
             raise ValueError("diameter_m must be below pitch_m")
         return self
@@ -145,7 +143,7 @@ class LedGridTarget(_Board, LampSpec):
     light: ReflectanceSpec = SpectrumSpec(flat=0.05)
 
     @model_validator(mode="after")
-    def _apart(self) -> LedGridTarget:
+    def _apart(self) -> "LedGridTarget":
         if self.diameter_m >= self.pitch_m:
             raise ValueError("diameter_m must be below pitch_m")
         return self

@@ -1,7 +1,5 @@
 """``capture.yaml``: a person's description of the captures of a sensor."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
@@ -52,7 +50,7 @@ class CaptureSpec(Strict):
     )
 
     @model_validator(mode="after")
-    def _check(self) -> CaptureSpec:
+    def _check(self) -> "CaptureSpec":
         if (self.evs_tile_rows is None) != (self.evs_tile_cols is None):
             raise ValueError("evs_tile_rows and evs_tile_cols are given together or not at all")
         if self.tile_position is not None:

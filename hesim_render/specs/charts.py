@@ -3,8 +3,6 @@
 Targets of a scene file for resolution.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -70,7 +68,7 @@ class PatchChartTarget(SizedTarget, InFolder):
     surround: ReflectanceSpec = SpectrumSpec(flat=0.035)
 
     @model_validator(mode="after")
-    def _one_source(self) -> PatchChartTarget:
+    def _one_source(self) -> "PatchChartTarget":
         if (self.patches is None) == (self.spectra is None):
             raise ValueError("give patches or spectra, exactly one of them")
         if self.patches is not None and not (self.folder / self.patches).is_file():
@@ -109,7 +107,7 @@ class StepWedgeTarget(SizedTarget):
     reflectance_max: float = Field(0.9, gt=0, le=1)
 
     @model_validator(mode="after")
-    def _order(self) -> StepWedgeTarget:
+    def _order(self) -> "StepWedgeTarget":
         if self.reflectance_min >= self.reflectance_max:
             raise ValueError("reflectance_min must be below reflectance_max")
         return self
@@ -123,7 +121,7 @@ class GreyRampTarget(SizedTarget):
     reflectance_max: float = Field(0.9, gt=0, le=1)
 
     @model_validator(mode="after")
-    def _order(self) -> GreyRampTarget:
+    def _order(self) -> "GreyRampTarget":
         if self.reflectance_min >= self.reflectance_max:
             raise ValueError("reflectance_min must be below reflectance_max")
         return self
@@ -146,7 +144,7 @@ class DeadLeavesTarget(SizedTarget):
     seed: int = Field(1, ge=0, lt=2**63)
 
     @model_validator(mode="after")
-    def _order(self) -> DeadLeavesTarget:
+    def _order(self) -> "DeadLeavesTarget":
         if self.radius_min_m >= self.radius_max_m:
             raise ValueError("radius_min_m must be below radius_max_m")
         if self.reflectance_min >= self.reflectance_max:
@@ -173,7 +171,7 @@ class IntegratingSphereTarget(PlacedTarget, LampSpec):
     luminance_cd_m2: float = Field(1000.0, ge=0, le=1e9, description="of the port, time mean")
 
     @model_validator(mode="after")
-    def _inside(self) -> IntegratingSphereTarget:
+    def _inside(self) -> "IntegratingSphereTarget":
         if self.port_diameter_m >= self.plate_m:
             raise ValueError("port_diameter_m must be below plate_m")
         return self

@@ -1,7 +1,5 @@
 """Event pixels in the terms of data sheets, and in those of v2e, as a sensor file has them."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field, model_validator
@@ -28,7 +26,7 @@ class SpeedSpec(Strict):
     bandwidth_hz: float | None = Field(None, ge=1e-2, le=1e6, description="-3 dB frequency of the photoreceptor, Hz")
 
     @model_validator(mode="after")
-    def _one(self) -> SpeedSpec:
+    def _one(self) -> "SpeedSpec":
         if (self.latency_us is None) == (self.bandwidth_hz is None):
             raise ValueError("speed needs latency_us or bandwidth_hz, and not both")
         return self
@@ -56,7 +54,7 @@ class DataSheetSpec(Strict):
     refractory_us: int | None = Field(None, ge=1, le=10**9, description="dead time after an event")
 
     @model_validator(mode="after")
-    def _check(self) -> DataSheetSpec:
+    def _check(self) -> "DataSheetSpec":
         if len(self.background) == 2 and self.dark_lux is not None:
             raise ValueError("dark_lux follows from two background rates: leave one of them out")
         if len(self.background) == 1 and self.dark_lux is None:

@@ -1,7 +1,5 @@
 """The file of a filter design: what is varied, for which lights and levels, at what cost, and how it is judged."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -22,7 +20,7 @@ class CostSpec(Strict):
     events: float = Field(0.0, ge=0, description="of the relative contrast that gives an event on a grey card")
 
     @model_validator(mode="after")
-    def _some(self) -> CostSpec:
+    def _some(self) -> "CostSpec":
         if self.colour + self.noise + self.events == 0:
             raise ValueError("at least one weight must be above 0")
         return self
@@ -76,7 +74,7 @@ class DesignSpec(NamesFiles):
     repeats: int = Field(8, ge=2, le=1000, description="noisy frames of the judgement")
 
     @model_validator(mode="after")
-    def _check(self) -> DesignSpec:
+    def _check(self) -> "DesignSpec":
         if self.transmittance_min >= self.transmittance_max:
             raise ValueError("transmittance_min must be below transmittance_max")
         if len(set(self.vary)) != len(self.vary):

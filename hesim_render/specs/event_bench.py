@@ -1,7 +1,5 @@
 """``bench.yaml``: recordings that were made of event pixels on a bench, and the light of each."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field, model_validator
@@ -23,7 +21,7 @@ class BenchRecording(Strict):
     )
 
     @model_validator(mode="after")
-    def _check_interval(self) -> BenchRecording:
+    def _check_interval(self) -> "BenchRecording":
         if self.interval_us is not None and not 0 <= self.interval_us[0] < self.interval_us[1]:
             raise ValueError("interval_us: expected a begin of 0 or more and a later end")
         return self
@@ -45,7 +43,7 @@ class LightSteps(BenchRecording):
     reset: bool = Field(False, description="before each jump, all pixels were reset to the level from which it starts")
 
     @model_validator(mode="after")
-    def _check(self) -> LightSteps:
+    def _check(self) -> "LightSteps":
         if (self.begin_us is None) != (self.period_us is None) or (self.begin_us is None) == (self.trigger is None):
             raise ValueError("give begin_us and period_us, or trigger, to say when the light jumps")
         return self
@@ -71,7 +69,7 @@ class Modulation(BenchRecording):
     bursts: Bursts | None = Field(None, description="for pixels whose dead time is not short against a cycle")
 
     @model_validator(mode="after")
-    def _check(self) -> Modulation:
+    def _check(self) -> "Modulation":
         if self.bursts is not None:
             if self.bursts.length_us * self.hz < 4e6 * (1 - 1e-9):
                 raise ValueError("bursts.length_us: expected four cycles of hz or more")
@@ -99,7 +97,7 @@ class EventBenchSpec(Strict):
     frames: str | None = Field(None, description="folder of EMVA 1288 captures of the same sensor")
 
     @model_validator(mode="after")
-    def _check(self) -> EventBenchSpec:
+    def _check(self) -> "EventBenchSpec":
         if (self.rows is None) != (self.cols is None):
             raise ValueError("rows and cols are given together or not at all")
         if not (self.steady or self.steps or self.modulation or self.busy or self.frames):

@@ -7,8 +7,6 @@ The leak of event pixels, as a sensor file describes it.
 The photoreceptor of event pixels, as a sensor file describes it.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 
@@ -36,7 +34,7 @@ class EventDefectSpec(Strict):
     flickering_quiet_s: float | None = Field(None, ge=1e-5, le=1e6, description="mean time for which it does not")
 
     @model_validator(mode="after")
-    def _check(self) -> EventDefectSpec:
+    def _check(self) -> "EventDefectSpec":
         if self.hot_share > 0 and self.hot_rate_hz is None:
             raise ValueError("hot_share needs hot_rate_hz")
         timing = (self.flickering_rate_hz, self.flickering_firing_s, self.flickering_quiet_s)
@@ -78,7 +76,7 @@ class PhotoreceptorSpec(Strict):
     )  # fmt: skip
 
     @model_validator(mode="after")
-    def _check(self) -> PhotoreceptorSpec:
+    def _check(self) -> "PhotoreceptorSpec":
         if self.follows_light:
             if self.signal_dn is None or self.min_cutoff_hz is None:
                 raise ValueError("a corner that follows the light needs signal_dn and min_cutoff_hz")
@@ -121,7 +119,7 @@ class LeakSpec(Strict):
     )  # fmt: skip
 
     @model_validator(mode="after")
-    def _check(self) -> LeakSpec:
+    def _check(self) -> "LeakSpec":
         if self.process == "poisson" and (self.rate_hz_per_dn or self.spread_rel or self.tail_hz):
             raise ValueError(
                 "rate_hz_per_dn, spread and tail_hz belong to process 'drift'; 'poisson' has rate_hz alone"
@@ -213,7 +211,7 @@ class SheetEvsSpec(Strict):
     )
 
     @model_validator(mode="after")
-    def _check_sheet(self) -> SheetEvsSpec:
+    def _check_sheet(self) -> "SheetEvsSpec":
         if self.data_sheet is not None and self.v2e is not None:
             raise ValueError("data_sheet and v2e say the same in two ways: leave one of them out")
         if self.leak is not None and self.leak.process == "drift" and self.reference != "last_event":
@@ -249,7 +247,7 @@ class EvsSpec(SheetEvsSpec):
     )
 
     @model_validator(mode="after")
-    def _check(self) -> EvsSpec:
+    def _check(self) -> "EvsSpec":
         if self.reference == "previous_sample":
             if self.tick_us is None:
                 raise ValueError("reference 'previous_sample' needs tick_us")

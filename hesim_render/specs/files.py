@@ -1,7 +1,5 @@
 """Reading a YAML file into a pydantic model; every error names file, line and key."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

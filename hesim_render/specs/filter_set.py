@@ -4,8 +4,6 @@ A filter set is a tile with the filter and the roles of each letter. A palette h
 may replace the quantum efficiency, so that all sets of one palette stand before the same silicon.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,7 +30,7 @@ class PaletteSpec(Strict):
     assumptions: dict[str, str] = {}
 
     @model_validator(mode="after")
-    def _check(self) -> PaletteSpec:
+    def _check(self) -> "PaletteSpec":
         parts = [(f"filters.{name}", spec) for name, spec in self.filters.items()]
         if self.quantum_efficiency is not None:
             parts.append(("quantum_efficiency", self.quantum_efficiency))
@@ -63,7 +61,7 @@ class FilterSetSpec(Strict):
         return tile_text(value)
 
     @model_validator(mode="after")
-    def _check(self) -> FilterSetSpec:
+    def _check(self) -> "FilterSetSpec":
         drawn = set("".join(self.tile.split()))
         problems = [f"tile: the letter {letter!r} is not defined under 'pixels'" for letter in drawn - set(self.pixels)]
         problems += [

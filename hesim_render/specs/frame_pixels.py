@@ -1,7 +1,5 @@
 """The ``aps`` section of a sensor file: frame pixels and their noise."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field, PositiveInt, model_validator
@@ -72,7 +70,7 @@ class ApsSpec(Strict):
     )
 
     @model_validator(mode="after")
-    def _check(self) -> ApsSpec:
+    def _check(self) -> "ApsSpec":
         if self.shutter == "rolling" and self.line_time_us == 0:
             raise ValueError("a rolling shutter needs line_time_us above 0")
         if self.black_level_dn >= 2**self.bit_depth - 1:

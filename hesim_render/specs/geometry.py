@@ -1,7 +1,5 @@
 """Vectors, rigid poses and regions in files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -29,7 +27,7 @@ class Region(Strict):
     height_px: PositiveInt
 
     @model_validator(mode="after")
-    def _check(self) -> Region:
+    def _check(self) -> "Region":
         if self.width_px * self.height_px > MOST_PIXELS:
             raise ValueError(f"width_px and height_px: more than {MOST_PIXELS} pixels, as no sensor has")
         return self

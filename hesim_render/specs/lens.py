@@ -1,7 +1,5 @@
 """The lens of a sensor file: aperture, focal length, transmittance, and each of its aberrations."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
@@ -36,7 +34,7 @@ class IlluminationTable(Strict):
     relative: list[float] = Field(min_length=2)
 
     @model_validator(mode="after")
-    def _check(self) -> IlluminationTable:
+    def _check(self) -> "IlluminationTable":
         _rising("image_height_mm", self.image_height_mm, "relative", self.relative)
         if any(not 0 <= value <= 1 for value in self.relative):
             raise ValueError("relative illumination must lie in [0, 1]")
@@ -94,7 +92,7 @@ class GaussianPsf(Strict):
     fwhm_um: list[Annotated[float, Field(ge=0, le=1e4)]] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _check(self) -> GaussianPsf:
+    def _check(self) -> "GaussianPsf":
         _rising("image_height_mm", self.image_height_mm, "fwhm_um", self.fwhm_um)
         return self
 
@@ -133,7 +131,7 @@ class MeasuredPsf(Strict):
         return {**data, "kernels": kernels.tolist()}
 
     @model_validator(mode="after")
-    def _check(self) -> MeasuredPsf:
+    def _check(self) -> "MeasuredPsf":
         if self.kernels is None:
             raise ValueError("file is required, or kernels")
         where = "kernels" if self.file is None else "file"
@@ -166,7 +164,7 @@ class LateralChromatic(Strict):
     relative: list[Annotated[float, Field(ge=-0.1, le=0.1)]] = Field(min_length=2)
 
     @model_validator(mode="after")
-    def _check(self) -> LateralChromatic:
+    def _check(self) -> "LateralChromatic":
         _rising("wavelength_nm", self.wavelength_nm, "relative", self.relative)
         return self
 
@@ -206,12 +204,12 @@ class LensSpec(Strict):
     veiling_glare: float = Field(0.0, ge=0, lt=1, description="part of the light that is spread evenly over the sensor")
 
     @model_validator(mode="after")
-    def _check(self) -> LensSpec:
+    def _check(self) -> "LensSpec":
         if self.psf is not None and self.psf_fwhm_um > 0:
             raise ValueError("psf: give psf or psf_fwhm_um, not both")
         return self
 
-    def without(self, effects: Iterable[str]) -> LensSpec:
+    def without(self, effects: Iterable[str]) -> "LensSpec":
         """The lens with some effects (keys of `EFFECTS`) switched off."""
         neutral = {name: EFFECTS[name] for name in effects}
         if "psf" in neutral:

@@ -3,8 +3,6 @@
 The waveform of a flickering light in a scene file.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from itertools import pairwise
 from typing import Annotated, Literal
@@ -55,7 +53,7 @@ class TableWaveformSpec(Strict):
     repeat: bool = Field(False, description="start over after the last sample; else the end values hold")
 
     @model_validator(mode="after")
-    def _check(self) -> TableWaveformSpec:
+    def _check(self) -> "TableWaveformSpec":
         if len(self.value) != len(self.t_us):
             raise ValueError(f"value: {len(self.value)} values for {len(self.t_us)} times")
         for earlier, later in pairwise(self.t_us):
@@ -102,7 +100,7 @@ class LightSpec(InFolder):
     waveform: WaveformSpec | None = Field(None, description="flicker; default steady")
 
     @model_validator(mode="after")
-    def _check(self) -> LightSpec:
+    def _check(self) -> "LightSpec":
         levels = [v for v in (self.illuminance_lux, self.irradiance_w_m2) if v is not None]
         if len(levels) != (self.type != "none"):
             raise ValueError(
@@ -131,7 +129,7 @@ class LightSpec(InFolder):
         """False in darkness: type 'none', or a level of zero."""
         return self.type != "none" and bool(self.illuminance_lux or self.irradiance_w_m2)
 
-    def unlit(self) -> LightSpec:
+    def unlit(self) -> "LightSpec":
         """The same light switched off; its geometry stays."""
         off = {"waveform": None, "illuminance_lux": 0.0, "irradiance_w_m2": None}
         return self if self.type == "none" else self.model_copy(update=off)
@@ -149,7 +147,7 @@ class LampSpec(Strict):
         """False where the luminance is zero."""
         return self.luminance_cd_m2 > 0
 
-    def unlit(self) -> LampSpec:
+    def unlit(self) -> "LampSpec":
         """The same target switched off; its geometry stays."""
         return self.model_copy(update={"waveform": None, "luminance_cd_m2": 0.0})
 

@@ -1,7 +1,5 @@
 """The ``mitsuba`` section of a scene file: a scene in Mitsuba's own formats."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -37,7 +35,7 @@ class MitsubaSpec(Strict):
     unlit: tuple[str, ...] = Field((), description="these emitters give none")
 
     @model_validator(mode="after")
-    def _check(self) -> MitsubaSpec:
+    def _check(self) -> "MitsubaSpec":
         if sum(value is not None for value in (self.file, self.builtin, self.inline)) != 1:
             raise ValueError("give exactly one of file, builtin and inline")
         if self.lit is not None and self.unlit:

@@ -3,8 +3,6 @@
 A mesh that changes its shape: positions of its vertices at some times, in files.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any
@@ -37,13 +35,15 @@ class KeyframeSpec(Strict):
     matrix: RigidMatrix | None = Field(None, description="4×4 by rows, instead of translation and rotation")
 
     @model_validator(mode="after")
-    def _check(self) -> KeyframeSpec:
+    def _check(self) -> "KeyframeSpec":
         other = self.model_fields_set & {"translation_m", "rotation_axis", "rotation_deg"}
         if self.matrix is not None and other:
             raise ValueError(f"give matrix or {', '.join(sorted(other))}, not both")
         return self
 
-    def resolved(self, pivot_m: Vector, before: KeyframeSpec | None, turn: NDArray[np.float64] | None) -> KeyframeSpec:
+    def resolved(
+        self, pivot_m: Vector, before: "KeyframeSpec | None", turn: NDArray[np.float64] | None
+    ) -> "KeyframeSpec":
         """The keyframe without a matrix: x → R (x − pivot) + pivot + translation.
 
         Parameters
@@ -137,7 +137,7 @@ class TrackSpec(Strict):
         return result
 
     @model_validator(mode="after")
-    def _check(self) -> TrackSpec:
+    def _check(self) -> "TrackSpec":
         times = [frame.t_us for frame in self.keyframes]
         for earlier, later in zip(times[:-1], times[1:], strict=True):
             if later <= earlier:
@@ -172,7 +172,7 @@ class DeformationSpec(InFolder):
         return [str(Path(self.file) / path.name) for path in sorted(result)]
 
     @model_validator(mode="after")
-    def _check(self) -> DeformationSpec:
+    def _check(self) -> "DeformationSpec":
         if not self.path.exists():
             raise ValueError(f"no such file or folder: {self.path}")
         if self.path.is_dir() != (self.every_us is not None):

@@ -1,7 +1,5 @@
 """The file of a comparison with other event simulators: scenes, sensor, pictures, and how each peer is run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -46,7 +44,7 @@ class PeersSpec(Strict):
     folder: Path = Field(Path(), exclude=True)
 
     @model_validator(mode="after")
-    def _check(self) -> PeersSpec:
+    def _check(self) -> "PeersSpec":
         names = [peer.name for peer in self.peers]
         if len(set(names)) != len(names):
             raise ValueError(f"peers: each name once; there are {', '.join(names)}")

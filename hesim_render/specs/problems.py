@@ -1,7 +1,5 @@
 """Validation errors as messages with file, line and key, all of a file at once."""
 
-from __future__ import annotations
-
 import re
 import types
 import typing

@@ -3,8 +3,6 @@
 Surfaces of objects: pictures on them, and materials of Mitsuba by name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -57,7 +55,7 @@ class PictureFile(InFolder):
     interpolation: Literal["bilinear", "nearest"] = "bilinear"
 
     @model_validator(mode="after")
-    def _is_a_file(self) -> PictureFile:
+    def _is_a_file(self) -> "PictureFile":
         if not (self.folder / self.file).is_file():
             raise ValueError(f"no such file: {self.folder / self.file}")
         return self

@@ -3,8 +3,6 @@
 The kind of a YAML file by its keys: of a study (comparison, design, sweep), and a whole run or a scene.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
@@ -97,7 +95,7 @@ class RunSpec(NamesFiles):
         return None if value is False else value
 
     @model_validator(mode="after")
-    def _fits(self) -> RunSpec:
+    def _fits(self) -> "RunSpec":
         if sum(given is not None for given in (self.scene, self.video, self.cube)) != 1:
             raise ValueError("a run is of a 'scene', a 'video' or a 'cube'")
         if self.scene is None:

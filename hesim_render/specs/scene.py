@@ -4,8 +4,6 @@ Lengths are in metres, y is up. A target lies in the plane z = 0, its centre at 
 face towards +z; the camera looks at it along −z with +x to the right of the image.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -58,7 +56,7 @@ class ObjectSpec(Strict):
     deformation: DeformationSpec | None = Field(None, description="of a PLY or OBJ mesh: its shape at other times")
 
     @model_validator(mode="after")
-    def _check(self) -> ObjectSpec:
+    def _check(self) -> "ObjectSpec":
         if (self.shape == "mesh") != (self.mesh is not None):
             raise ValueError("shape 'mesh' and the key 'mesh' go together")
         if self.materials == "file" and not str(self.mesh).lower().endswith((".glb", ".gltf")):
@@ -98,7 +96,7 @@ class CameraSpec(Strict):
     focus_distance_m: Size | None = Field(None, description="default: distance from origin to target")
 
     @model_validator(mode="after")
-    def _check(self) -> CameraSpec:
+    def _check(self) -> "CameraSpec":
         if self.focal_length_mm is not None and self.horizontal_fov_deg is not None:
             raise ValueError("give focal_length_mm or horizontal_fov_deg, not both")
         if self.fit is None and all(a == b for a, b in zip(self.origin_m, self.target_m, strict=True)):
@@ -165,7 +163,7 @@ class SceneSpec(Strict):
         return data
 
     @model_validator(mode="after")
-    def _check(self) -> SceneSpec:
+    def _check(self) -> "SceneSpec":
         tracks = [track.object for track in self.motion]
         if len(set(tracks)) != len(tracks):
             raise ValueError("motion: one track for each object; put all its keyframes into that")

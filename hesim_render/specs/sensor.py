@@ -4,8 +4,6 @@ Units are in the key names. ``sources`` and ``assumptions`` say, for every figur
 from or why it was assumed. A calibration is named by ``noise: calibration.yaml``.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal
 
@@ -147,7 +145,7 @@ class SensorSpec(Strict):
         return product(self.filters[name].load(), self.quantum_efficiency.load(), self.lens.transmittance.load())
 
     @model_validator(mode="after")
-    def _check(self) -> SensorSpec:
+    def _check(self) -> "SensorSpec":
         if problems := list(sensor_problems(self)):
             raise ValueError("\n".join(problems))
         return self

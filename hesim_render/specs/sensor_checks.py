@@ -1,7 +1,5 @@
 """Consistency checks of a sensor file: tile, pixels, roles, filters and their wavelengths."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +16,7 @@ if TYPE_CHECKING:
 _LOST = 1e-3
 
 
-def sensor_problems(spec: SensorSpec) -> Iterator[str]:
+def sensor_problems(spec: "SensorSpec") -> Iterator[str]:
     """All inconsistencies; each begins with its dotted key."""
     result = list(_tile(spec))
     if not result:  # otherwise the roles are not known
@@ -33,7 +31,7 @@ def sensor_problems(spec: SensorSpec) -> Iterator[str]:
                 yield f"{group}.{key}: there is no such key in this file"
 
 
-def _tile(spec: SensorSpec) -> Iterator[str]:
+def _tile(spec: "SensorSpec") -> Iterator[str]:
     rows = spec.tile_rows
     drawn = dict.fromkeys("".join(rows))
     for letter in drawn:
@@ -55,7 +53,7 @@ def _tile(spec: SensorSpec) -> Iterator[str]:
         )
 
 
-def _roles(spec: SensorSpec) -> Iterator[str]:
+def _roles(spec: "SensorSpec") -> Iterator[str]:
     aps, evs = spec.positions("aps"), spec.positions("evs")
     for role, positions, section in (("aps", aps, spec.aps), ("evs", evs, spec.evs)):
         if bool(positions) != (section is not None):
@@ -81,7 +79,7 @@ def _roles(spec: SensorSpec) -> Iterator[str]:
         yield f"evs.signal_reference.filter: no filter {reference!r}{did_you_mean(reference, spec.filters)}"
 
 
-def _filters(spec: SensorSpec) -> Iterator[str]:
+def _filters(spec: "SensorSpec") -> Iterator[str]:
     said: set[str] = set()
     quantum_efficiency = spec.quantum_efficiency.load()
     if quantum_efficiency.values.min() < 0 or quantum_efficiency.values.max() > 1:
@@ -109,7 +107,7 @@ def _filters(spec: SensorSpec) -> Iterator[str]:
             yield from _outside(name, response)
 
 
-def unused(spec: SensorSpec) -> Iterator[tuple[str, str]]:
+def unused(spec: "SensorSpec") -> Iterator[tuple[str, str]]:
     """Letters that are not in the tile and filters without a pixel: their keys, and how to correct the file."""
     drawn = set("".join(spec.tile_rows))
     for letter in spec.pixels:

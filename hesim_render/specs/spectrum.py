@@ -1,7 +1,5 @@
 """A spectrum in a file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -32,7 +30,7 @@ class DyeSpec(Strict):
     edges: list[tuple[_Wavelength, Annotated[float, Field(ge=-500, le=500)], _Density]] = []
 
     @model_validator(mode="after")
-    def _check(self) -> DyeSpec:
+    def _check(self) -> "DyeSpec":
         if any(width == 0 for _, width, _ in self.edges):
             raise ValueError("edges: the width of an edge must not be 0")
         return self
@@ -80,7 +78,7 @@ class SpectrumSpec(Strict):
         None, gt=0, le=1e4, description="quantum efficiency of a silicon layer of this depth"
     )
     surface: Literal["coated", "bare"] = Field("coated", description="of the silicon: no reflection, or that in air")
-    product: list[SpectrumSpec] | None = Field(None, min_length=2, max_length=20, description="of several spectra")
+    product: "list[SpectrumSpec] | None" = Field(None, min_length=2, max_length=20, description="of several spectra")
     scale: float = Field(1.0, description="multiplies all values")
     folder: Path = Field(Path(), exclude=True)
     _table: tuple[tuple[float, ...], tuple[float, ...]] | None = PrivateAttr(None)  # the table of `csv`, read once
@@ -101,7 +99,7 @@ class SpectrumSpec(Strict):
         return data
 
     @model_validator(mode="after")
-    def _one_source(self) -> SpectrumSpec:
+    def _one_source(self) -> "SpectrumSpec":
         sources = {
             "flat": self.flat,
             "csv": self.csv,

@@ -1,7 +1,5 @@
 """The file of a study of filter sets: what is combined, and which figures of each combination."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -52,7 +50,7 @@ class SurfacesSpec(NamesFiles):
         return {"reflectances": data} if isinstance(data, str) else data
 
     @model_validator(mode="after")
-    def _one(self) -> SurfacesSpec:
+    def _one(self) -> "SurfacesSpec":
         if sum(given is not None for given in (self.reflectances, self.cube, self.scene)) != 1:
             raise ValueError("surfaces are either 'reflectances', a 'cube' or a 'scene'")
         first, last, step = self.bands_nm
@@ -83,7 +81,7 @@ class NamedLight(Strict):
         return {"name": data, "spectrum": data} if isinstance(data, str) else data
 
     @model_validator(mode="after")
-    def _check(self) -> NamedLight:
+    def _check(self) -> "NamedLight":
         if self.spectrum.load().values.min() < 0:
             raise ValueError("spectrum: a light's spectrum must not be negative")
         return self
@@ -140,7 +138,7 @@ class StudySpec(NamesFiles):
         return value
 
     @model_validator(mode="after")
-    def _names(self) -> StudySpec:
+    def _names(self) -> "StudySpec":
         for key, names in (
             ("surfaces", [item.label for item in self.surfaces]),
             ("illuminants", [item.name for item in self.illuminants]),

@@ -1,7 +1,5 @@
 """The file of a sweep: keys that vary, seeds, and what is tabulated of every run."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
@@ -29,7 +27,7 @@ class RangeSpec(Strict):
     scale: Literal["linear", "log"] = "linear"
 
     @model_validator(mode="after")
-    def _check(self) -> RangeSpec:
+    def _check(self) -> "RangeSpec":
         if self.scale == "log" and (self.first <= 0 or self.last <= 0):
             raise ValueError("a logarithmic range needs ends above 0")
         return self
@@ -90,7 +88,7 @@ class SweepSpec(NamesFiles):
         return value
 
     @model_validator(mode="after")
-    def _kind(self) -> SweepSpec:
+    def _kind(self) -> "SweepSpec":
         if self.study is None:
             if not self.scenes or not self.sensors:
                 raise ValueError("a sweep needs 'scenes' and 'sensors', or a 'study'")
@@ -109,7 +107,7 @@ class SweepSpec(NamesFiles):
         return self.metrics or ["electrons", "snr", "event_rate"]
 
     @model_validator(mode="after")
-    def _countable(self) -> SweepSpec:
+    def _countable(self) -> "SweepSpec":
         total = max(1, len(self.scenes)) * max(1, len(self.sensors)) * len(self.seeds)
         for values in self.vary.values():
             total *= values.count if isinstance(values, RangeSpec) else len(values)

@@ -1,7 +1,5 @@
 """Calibration targets of a scene file: in the plane z = 0, centred on the origin, facing +z, unless placed so."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field

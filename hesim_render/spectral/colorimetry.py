@@ -5,8 +5,6 @@ colours, and judge millions of pixels: colour-science, with which tests compare 
 for both.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from math import pi

@@ -1,7 +1,5 @@
 """Patches of a user's chart from a CSV file: measured reflectances, or CIELAB values."""
 
-from __future__ import annotations
-
 import csv
 import functools
 import warnings

@@ -1,7 +1,5 @@
 """Spectra of physical parts: silicon of a stated depth, dyes as sums of absorption bands, stacks of thin films."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from pathlib import Path

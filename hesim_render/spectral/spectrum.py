@@ -7,8 +7,6 @@ grid is 0.25-0.4 % off, sums of 10 nm rectangles up to 8 %). Named data come fro
 ``named.npz``, because the import of colour-science takes most of a second.
 """
 
-from __future__ import annotations
-
 import functools
 import warnings
 from dataclasses import dataclass
@@ -71,7 +69,7 @@ class Spectrum:
         wanted = np.asarray(wavelength_nm, dtype=np.float64)
         return np.interp(wanted, self.wavelength_nm, self.values, left=0.0, right=0.0)
 
-    def scaled(self, factor: float) -> Spectrum:
+    def scaled(self, factor: float) -> "Spectrum":
         return Spectrum(self.wavelength_nm, self.values * factor)
 
     def integral(self) -> float:

@@ -1,7 +1,5 @@
 """Transfer functions between linear light and picture values, both ways."""
 
-from __future__ import annotations
-
 import functools
 from typing import Literal, get_args
 

@@ -5,8 +5,6 @@ does not repeat. All times are in µs. The functions take arrays, so that every 
 has its own interval.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """What a study compares: sensors with filter sets, and what each sees of surfaces under a light."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

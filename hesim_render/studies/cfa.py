@@ -3,8 +3,6 @@
 Of event pixels there are contrast sensitivity, noise rate, and steps between surfaces.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product

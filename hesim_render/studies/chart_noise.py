@@ -1,7 +1,5 @@
 """Full simulation of a chart with noise: RAW values of every patch, averaged to channels, balanced and corrected."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, sqrt
@@ -128,7 +126,7 @@ class Measured:
     high: float
 
     @classmethod
-    def of(cls, values: NDArray[np.float64]) -> Measured:
+    def of(cls, values: NDArray[np.float64]) -> "Measured":
         """From one value per repeat; without an interval for a single one."""
         from scipy.stats import t
 

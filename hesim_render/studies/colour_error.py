@@ -6,8 +6,6 @@ under the white of the light itself, so no chromatic adaptation is needed.
 Matrices that a study uses besides the best one: to sRGB, and against noise.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal, get_args

@@ -5,8 +5,6 @@ noise, shot noise, a part that grows with the square of the signal). A channel i
 balance and matrix are linear, so the variance of every output is a quadratic function of the light, too.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Surfaces of a study: sets of reflectances and hyperspectral cubes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

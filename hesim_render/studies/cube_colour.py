@@ -1,7 +1,5 @@
 """Colour errors of filter sets over all pixels of a hyperspectral cube, in bands of rows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path

@@ -3,8 +3,6 @@
 Test patterns as a pixel grid sees them: slanted edge, star and zone plate, each pixel the mean over its area.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

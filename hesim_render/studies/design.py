@@ -1,7 +1,5 @@
 """Design by gradients: filters, depth of the silicon and tile shares, from a file to palette and filter set."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

@@ -11,8 +11,6 @@ in M, so M is found by one linear solve; at this minimum the derivative of J wit
 constant M. All numbers have 64 bits, because a matrix of similar filters amplifies rounding.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -80,7 +78,7 @@ class Condition:
     weights: NDArray[np.float64]
 
     @classmethod
-    def of(cls, reflectances: Sequence[Spectrum], light: Spectrum, wavelength_nm: NDArray[np.float64]) -> Condition:
+    def of(cls, reflectances: Sequence[Spectrum], light: Spectrum, wavelength_nm: NDArray[np.float64]) -> "Condition":
         """From reflectances and an illuminant."""
         per_lux = scale_to_lux(light, 1.0).at(wavelength_nm) / np.pi
         surfaces = np.array([each.at(wavelength_nm) for each in reflectances])

@@ -3,8 +3,6 @@
 A family turns its parameters into the transmittance at given wavelengths, on Dr.Jit and so with derivatives.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import log, pi
 from typing import Protocol

@@ -3,8 +3,6 @@
 The files of a design: its filters as a palette, its tile as a filter set.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Tile shares: from shares of the frame pixels to a tile with whole pixels, each filter spread evenly."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """A sensor with another filter set: tile, filters and roles are exchanged, pixels, lens and noise stay."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

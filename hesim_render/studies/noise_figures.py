@@ -3,8 +3,6 @@
 Exposures at which sensors and filter sets are compared: equal exposure, equal light, equal white.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import pi
 

@@ -1,7 +1,5 @@
 """The HTML report of a study, with its plots: one file that needs no other file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any

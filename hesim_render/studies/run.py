@@ -1,7 +1,5 @@
 """Run a study from its file, and write its results."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from contextlib import nullcontext

@@ -4,8 +4,6 @@ A camera whose curves are linear combinations of the colour-matching functions (
 as the observer does. The figures here say how far a camera is from it, without any reflectances or noise.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sweeps: one simulation or study for each combination of keys and seeds, with figures of each; they can be resumed."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json
@@ -151,11 +149,11 @@ def check_sweep(spec: str | Path | Mapping[str, Any] | SweepSpec, out: str | Pat
     return len(runs), sum(not _file_of(folder, made, run).is_file() for run in runs)
 
 
-def _made(spec: SweepSpec, folder: Path) -> _Studies | _Recordings:
+def _made(spec: SweepSpec, folder: Path) -> "_Studies | _Recordings":
     return _Recordings(spec, folder) if spec.study is None else _Studies(spec)
 
 
-def _file_of(folder: Path, made: _Studies | _Recordings, run: Run) -> Path:
+def _file_of(folder: Path, made: "_Studies | _Recordings", run: Run) -> Path:
     return folder / "runs" / f"{_digest(made.identity(run))}.json"
 
 
@@ -166,7 +164,7 @@ def _first_of_each(runs: Sequence[Run]) -> dict[str, int]:
     return result
 
 
-def _rows(made: _Studies | _Recordings, run: Run, folder: Path) -> list[dict[str, Cell]]:
+def _rows(made: "_Studies | _Recordings", run: Run, folder: Path) -> list[dict[str, Cell]]:
     """Rows of a run, from its file if there is one."""
     combination = ", ".join(f"{key}={value}" for key, value in run.cells.items())
     try:

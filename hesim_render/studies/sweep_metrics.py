@@ -1,7 +1,5 @@
 """Figures of one recording of a sweep: of its RAW frames, its events, and its first frame after the ISP."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property

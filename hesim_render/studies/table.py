@@ -3,8 +3,6 @@
 What the columns of a study are called in tables for people, and which of them know the noise.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -76,7 +74,7 @@ class Table:
         """One row with all columns; negative numbers count from the end."""
         return {name: self._rows[number].get(name) for name in self._columns}
 
-    def where(self, **cells: Cell) -> Table:
+    def where(self, **cells: Cell) -> "Table":
         """The rows whose cells have given values, as a new table.
 
         Parameters

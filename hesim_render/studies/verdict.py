@@ -1,7 +1,5 @@
 """Verdicts of a comparison: at each level of light one sentence that ranks the filter sets, and says what got worse."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

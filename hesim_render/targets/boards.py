@@ -1,7 +1,5 @@
 """Boards for geometric calibration: squares, tags, discs and lamps."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

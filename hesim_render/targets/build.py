@@ -1,7 +1,5 @@
 """Exact geometry of the calibration targets: one mesh per reflectance, in the plane z = 0, face to +z."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Readers of pictures and of hyperspectral cubes, one for each kind of file, and pictures as targets."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Layouts are those in which CAVE, ICVL, KAIST, Harvard, ARAD-1K and ISETCam store
 needed: a file says by its names and shapes which layout it has.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Hyperspectral cubes in MATLAB and HDF5 files, in the layouts of ARAD-1K, ICVL, Harvard, Foster and ISETCam."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """An open hyperspectral cube, read by bands of rows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Parts of a target, each of one reflectance or one picture, and the polygons that they are made of."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import pi, sin, sqrt

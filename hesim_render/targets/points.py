@@ -1,7 +1,5 @@
 """Places of the points that a calibration finds on a target."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

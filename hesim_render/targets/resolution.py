@@ -1,7 +1,5 @@
 """Charts for resolution: edges, star, wedges, zone plate, and dead leaves with their autocovariance in closed form."""
 
-from __future__ import annotations
-
 from math import cos, pi, radians, sin, tan
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Trajectory files: times with a pose each, as CSV, TUM, EuRoC, Kalibr and OpenCV write them."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ An error has the noise of the captures, that of the simulated frames, and that o
 does between exposures (light, black level) and the ADC's uneven steps scatter by the amount that the fitted half shows.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

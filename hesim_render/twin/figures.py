@@ -1,7 +1,5 @@
 """Figures of a set of EMVA 1288 captures that a twin is compared by: defects and spectra of the long series."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

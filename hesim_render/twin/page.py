@@ -1,7 +1,5 @@
 """The page of a twin: what was found, pass or fail of each check, and both curves over each other."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A twin: calibrated on half of EMVA 1288 captures, tested on the other half."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Frames of a twin on the bench of its captures: the same lights and exposures, one frame at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

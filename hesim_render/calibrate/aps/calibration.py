@@ -1,7 +1,5 @@
 """APS calibration: from dark and lit frames to fixed maps, variance polynomials and photon transfer."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any

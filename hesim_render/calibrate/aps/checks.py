@@ -5,8 +5,6 @@ significant but changes a parameter by less than half its standard error, or the
 not reported.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ it is the mean covariance of two pixels. The mean of a row, minus the mean of it
 of the frame gives that of the frame.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

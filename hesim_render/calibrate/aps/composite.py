@@ -1,7 +1,5 @@
 """The noise-free signal of the scene from all exposures: a rate of light per pixel, DN/s."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Parameters of the dark frames: N_DP, N_FP, rows, black level, hot pixels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Results of the frames of a capture set before they are written."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Straight and bent lines through the levels of an EMVA 1288 set: gain, responsivity, linearity, mean curve."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

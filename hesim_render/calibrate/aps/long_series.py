@@ -1,7 +1,5 @@
 """The two long series of EMVA 1288 captures: their mean, temporal and spatial variances."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

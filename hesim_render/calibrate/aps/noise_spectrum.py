@@ -3,8 +3,6 @@
 Interference is a periodic pattern of a read-out that stands still in a frame and has a new phase in the next one.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

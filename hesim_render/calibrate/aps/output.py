@@ -1,7 +1,5 @@
 """Output of an APS calibration: its section of ``calibration.yaml``, its maps and the data of the report's figures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Mean and temporal variance of each light and exposure of an EMVA 1288 set, from the difference of its two frames."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ give DSNU, PRNU, defects and the fixed maps. Beyond the standard, the curve of t
 columns get anew in each frame, because a twin of the sensor needs them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """What EMVA 1288 captures show beyond the standard's linear model: of the sensor, and of the bench."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_law

@@ -1,7 +1,5 @@
 """Output of a calibration from EMVA 1288 captures: its section of ``calibration.yaml`` and its maps."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any

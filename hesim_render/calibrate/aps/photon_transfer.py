@@ -1,7 +1,5 @@
 """Photon transfer in the terms of EMVA 1288 [emva2021], beside the polynomial of the paper."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

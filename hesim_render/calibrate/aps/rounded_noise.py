@@ -9,8 +9,6 @@ Where the noise is larger, Sheppard's 1/12 nearly holds. With e = exp(−2π²σ
 rounded value is μ − e sin(2πμ)/π, and its variance σ² + 1/12 − e (4σ² + 1/π²) cos(2πμ).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """A sensor file that goes with a calibration from EMVA 1288 captures."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

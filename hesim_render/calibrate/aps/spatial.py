@@ -1,7 +1,5 @@
 """Spatial variances of the mean of a long series: rows, columns and pixels, and their maps without temporal noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

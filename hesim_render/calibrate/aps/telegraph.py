@@ -6,8 +6,6 @@ by expectation maximisation [baum1970]), each with a Gaussian of its own width a
 if their likelihood is larger than noise of one level, of any width, can reach.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

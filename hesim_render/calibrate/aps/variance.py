@@ -7,8 +7,6 @@ that, from the fit itself: the score equation is then that of maximum likelihood
 into bins of brightness that keep their moments: only the weight is constant within a bin.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial

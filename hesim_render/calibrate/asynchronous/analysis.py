@@ -1,7 +1,5 @@
 """Analysis of trials after a reset of an asynchronous sensor, and maps of its pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

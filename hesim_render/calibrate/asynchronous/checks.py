@@ -4,8 +4,6 @@ A test of moments (Newey 1985; Tauchen 1985): the mean over pixels of what was c
 its scatter over pixels, is normal. The part that the fit itself removed is taken into account by the pixels' scores.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Outlying asynchronous event pixels: detected where no possible threshold explains the counts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

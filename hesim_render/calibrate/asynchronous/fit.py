@@ -4,8 +4,6 @@ Scoring with the outer product of the pixels' own scores [berndt1974], which is 
 time the information: each pixel, with thresholds of its own, is one independent draw.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

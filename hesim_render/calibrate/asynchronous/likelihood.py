@@ -26,8 +26,6 @@ bivariate normal probability. Noise without nodes passes h = 0 to 2 by 5 % more 
 a sensor with such noise, the fitted f_c differs from its own f_c accordingly: it gives the right rates in a simulation.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -120,7 +118,7 @@ class TrialCounts:
     silent: NDArray[np.float64]
 
     @classmethod
-    def of(cls, sets: Sequence[Trials], polarity: int) -> TrialCounts:
+    def of(cls, sets: Sequence[Trials], polarity: int) -> "TrialCounts":
         sets = [t.towards(polarity) for t in sets]
         own = [t.events(polarity).reshape(-1, t.calm.shape[1]) for t in sets]
         silent = [t.calm - t.on.sum(axis=1, dtype=np.int64) - t.off.sum(axis=1, dtype=np.int64) for t in sets]
@@ -161,7 +159,7 @@ class Likelihood:
     grids: tuple[NDArray[np.float64], NDArray[np.float64]]
 
     @classmethod
-    def of(cls, sets: Sequence[Trials], law: Law, grids: tuple[NDArray, NDArray]) -> Likelihood:
+    def of(cls, sets: Sequence[Trials], law: Law, grids: tuple[NDArray, NDArray]) -> "Likelihood":
         return cls(law, (TrialCounts.of(sets, 1), TrialCounts.of(sets, -1)), grids)
 
     def given_thresholds(self, values: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -1,7 +1,5 @@
 """Output of the calibration of an asynchronous sensor: its section of ``calibration.yaml``, maps and figures."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

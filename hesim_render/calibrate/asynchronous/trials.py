@@ -7,8 +7,6 @@ the bins. ``evs_noise_rate.npz`` may also hold counts of successive parts of the
 tell flickering pixels from steady ones.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,14 +71,14 @@ class Trials:
     shape: tuple[int, int]
     parts: Parts | None = None
 
-    def of(self, pixels: NDArray) -> Trials:
+    def of(self, pixels: NDArray) -> "Trials":
         """Trials of some pixels, given by indices or a mask, without their parts."""
         return Trials(
             self.signal_dn, self.contrast, self.settle_s, self.edges_s, self.calm[:, pixels], self.on[..., pixels],
             self.off[..., pixels], self.shape,
         )  # fmt: skip
 
-    def towards(self, polarity: int) -> Trials:
+    def towards(self, polarity: int) -> "Trials":
         """The trials without steps towards the other polarity."""
         kinds = np.flatnonzero(np.sign(self.contrast) != -polarity)
         return Trials(

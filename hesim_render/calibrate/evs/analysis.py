@@ -1,7 +1,5 @@
 """Analysis of the event counts of a sensor with fixed comparisons: A, B, C, D, thresholds and their mismatch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -166,7 +164,7 @@ class _Begun(NamedTuple):
     theta_v: float
 
     @classmethod
-    def of(cls, static: StaticCapture, good: NDArray[np.bool_], theta_v: float) -> _Begun:
+    def of(cls, static: StaticCapture, good: NDArray[np.bool_], theta_v: float) -> "_Begun":
         typical = Typical.of(static, good)
         begun = {law: best_start(typical.cells, theta_v, law) for law in _LAWS}
         lead = (begun["sqrt"][1] - begun["linear"][1]) / min(begun["sqrt"][2], begun["linear"][2])

@@ -1,7 +1,5 @@
 """EVS calibration: from counts of events to the parameters of the event pixels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from hesim_render.calibrate.aps.calibration import described_captures

@@ -1,7 +1,5 @@
 """Event counts pooled over pixels that are alike in brightness, polarity and, where it was measured, threshold."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -33,7 +31,7 @@ class PixelThresholds:
     off_spread: NDArray[np.float64]
 
     @classmethod
-    def unknown(cls, shape: tuple[int, ...], mismatch: float) -> PixelThresholds:
+    def unknown(cls, shape: tuple[int, ...], mismatch: float) -> "PixelThresholds":
         one, spread = np.ones(shape), np.full(shape, mismatch)
         return cls(one, one, spread, spread)
 
@@ -65,7 +63,7 @@ class Cells:
         """Trials of all pixels of a cell."""
         return self.pixels * self.trials
 
-    def coarser(self, most: int = 150) -> Cells:
+    def coarser(self, most: int = 150) -> "Cells":
         """At most `most` cells of each polarity, by pooling neighbours in brightness. For searches, not for results."""
         order = np.lexsort((self.signal_dn, self.polarity))
         pixels = self.pixels[order]
@@ -85,7 +83,7 @@ class Cells:
         events = np.bincount(group, self.events[order]).astype(np.float64)
         return Cells(mean(self.signal_dn), mean(self.polarity), relative, spread, total, events, self.trials)
 
-    def typical(self) -> Cells:
+    def typical(self) -> "Cells":
         """The cells whose known thresholds are near the mean, or all if none is.
 
         A pixel whose threshold nearly vanishes has a thousand times the events of others. Pooled with them it would
@@ -97,7 +95,7 @@ class Cells:
         parts = {f.name: getattr(self, f.name)[near] for f in fields(self) if f.name != "trials"}
         return replace(self, **parts)
 
-    def with_spread(self, factor: float) -> Cells:
+    def with_spread(self, factor: float) -> "Cells":
         """The same cells with the spread of thresholds scaled."""
         return replace(self, spread=self.spread * factor)
 

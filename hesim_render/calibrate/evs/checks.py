@@ -11,8 +11,6 @@ Floor and ceiling of the S-curves are spontaneous and lost events::
 groups of pixels, as in `thresholds`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +36,7 @@ _ROUNDS, _ENOUGH = 30, 1e-7
 _LEAST_VARIANCE = 1e-5
 
 
-def check_events(result: EvsCalibration, contrast_of: str) -> tuple[list[Finding], CurveLevels | None]:
+def check_events(result: EvsCalibration, contrast_of: str) -> "tuple[list[Finding], CurveLevels | None]":
     """Every check of the events, and the levels of the S-curves where they were captured."""
     outcome = [_counts(result), _starts(result)]
     levels = None
@@ -84,7 +82,7 @@ def _starts(result: EvsCalibration) -> Finding | None:
     )
 
 
-def _ceiling(levels: CurveLevels) -> Finding | None:
+def _ceiling(levels: "CurveLevels") -> Finding | None:
     value, error = levels.ceiling
     p_value = float(norm.sf((1 - value) / max(error, 1e-12)))
     if p_value > ALARM or 1 - value < _LEAST_LOSS:
@@ -98,7 +96,7 @@ def _ceiling(levels: CurveLevels) -> Finding | None:
     )
 
 
-def _floor(result: EvsCalibration, levels: CurveLevels) -> Finding | None:
+def _floor(result: EvsCalibration, levels: "CurveLevels") -> Finding | None:
     """Finding of events of steps in the other direction, and of ON events beyond leak."""
     fit = result.together
     leak, leak_error = (fit.values[5], np.sqrt(max(fit.covariance[5, 5], 0.0))) if fit.free[5] else (0.0, 0.0)

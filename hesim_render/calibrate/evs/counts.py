@@ -1,7 +1,5 @@
 """``evs_static.npz``: event counts of a static scene, read and checked."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Outlying event pixels: detected where no threshold within the spread explains the counts, then classified."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

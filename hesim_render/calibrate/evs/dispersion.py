@@ -1,7 +1,5 @@
 """Scatter of event counts beyond counting statistics: over pixels (thresholds), and in time (noise)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,7 +123,7 @@ class _Mixture:
     trials: int
 
     @classmethod
-    def of(cls, pixels: PixelCounts, typical: Typical) -> _Mixture:
+    def of(cls, pixels: PixelCounts, typical: Typical) -> "_Mixture":
         """A sample of the counts of which more than one event is expected."""
         u = np.stack([
             typical.threshold_over_noise(k, pixels.single(k).signal_dn) for k in range(len(pixels.counts))

@@ -4,8 +4,6 @@ Fisher scoring with Levenberg–Marquardt damping. Parameters carry a leading ax
 cost little more than one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The event model fitted to pooled counts: the identified parameters and their errors; searches from many starts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

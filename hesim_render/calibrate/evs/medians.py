@@ -1,7 +1,5 @@
 """Thresholds over noise from medians of counts, which bad pixels hardly affect."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -142,7 +140,7 @@ class Typical:
     lines: list[tuple[NDArray[np.float64], NDArray[np.float64]]]
 
     @classmethod
-    def of(cls, static: StaticCapture, good: NDArray[np.bool_]) -> Typical:
+    def of(cls, static: StaticCapture, good: NDArray[np.bool_]) -> "Typical":
         lines, polarities, numbers = [], [], []
         spread = spread_of_thresholds(static, good)
         for signal, *both in static.sessions:

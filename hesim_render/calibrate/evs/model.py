@@ -10,8 +10,6 @@ part, relative to the same mean: the mean of Q(u (r + m z)) over a normal z is e
 Whether it describes the counts is tested by χ² by brightness, with the scatter measured over pixels.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``evs_steps.npz``: events after steps of contrast, read one step at a time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

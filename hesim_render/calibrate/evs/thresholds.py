@@ -7,8 +7,6 @@ The mismatch is the scatter of the pixels' summed counts over the steps beyond c
 a jackknife over groups of pixels: the counts of a pixel share its threshold, at all steps.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -160,7 +158,7 @@ class _Sums:
     squares: NDArray[np.float64]  # the same of their squares
 
     @classmethod
-    def of(cls, steps: Steps, good: NDArray[np.bool_]) -> _Sums:
+    def of(cls, steps: Steps, good: NDArray[np.bool_]) -> "_Sums":
         group = steps.group[good]
         totals = [total[good].astype(np.float64) for total in (steps.on_total, steps.off_total)]
         return cls(
@@ -169,7 +167,7 @@ class _Sums:
             np.array([np.bincount(group, t * t, GROUPS) for t in totals]),
         )  # fmt: skip
 
-    def without(self, k: int) -> _Sums:
+    def without(self, k: int) -> "_Sums":
         keep = np.arange(self.pixels.size) != k
         return _Sums(*(values[..., keep] for values in vars(self).values()))
 

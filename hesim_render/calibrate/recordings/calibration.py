@@ -1,7 +1,5 @@
 """Calibration of event pixels from ordinary recordings, and its file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

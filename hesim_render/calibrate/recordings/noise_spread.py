@@ -12,8 +12,6 @@ event to one of the other polarity, times its rate: both have f in them, and the
 alone. Covariances are those of counts in both halves of the time, which counting has no part in.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

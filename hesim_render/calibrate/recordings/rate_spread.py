@@ -1,7 +1,5 @@
 """Spread of the rates of event pixels over pixels, and how even their intervals are, in recordings of still scenes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -12,8 +12,6 @@ With θ the threshold, late events come at the rate d/dt (mean highest level)/θ
 the bandwidth in part.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -66,7 +64,7 @@ class Ramps(NamedTuple):
     drift: float
     rest_s: float
 
-    def leaking(self, part: float) -> Ramps:
+    def leaking(self, part: float) -> "Ramps":
         """The same with a drift so many times as large."""
         return self._replace(drift=part * self.drift)
 

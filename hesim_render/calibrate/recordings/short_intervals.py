@@ -1,7 +1,5 @@
 """Dead time of pixels and limit of the read-out, from the shortest intervals and the busiest windows of recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

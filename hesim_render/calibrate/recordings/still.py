@@ -6,8 +6,6 @@ therefore n₊ − ρ n₋, however the noise may be. With three lights, ρ, the
 straight line.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """What a recording of events holds in numbers of bounded size, taken block by block."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import cast
 

@@ -8,8 +8,6 @@ slowly enough for the pixels, and noise must be small against the thresholds. Wh
 bottom, noise carries the level further than the light; by how much is read from late events (`rests`).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The report's section on events, of a sensor with fixed comparisons or of an asynchronous one."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,7 +43,7 @@ def evs_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
     )
 
 
-def _rate_panel(title: str, signal: NDArray) -> tuple[Figure, Axes]:
+def _rate_panel(title: str, signal: NDArray) -> "tuple[Figure, Axes]":
     """Axes of event probabilities; the light is logarithmic, with 0 on it, where it spans more than a factor of 100."""
     figure, axes = panel(title, "light signal, DN", "P per trial")
     darkest_lit = float(signal[signal > 0].min(initial=np.inf))
@@ -58,7 +56,7 @@ def _rate_panel(title: str, signal: NDArray) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _end_of_axis(axes: Axes, counted: float, fitted: float) -> None:
+def _end_of_axis(axes: "Axes", counted: float, fitted: float) -> None:
     """End the axis so that all counts are visible, and the fit down to a hundredth of them. A short axis has more
     numbers.
     """

@@ -1,7 +1,5 @@
 """The report's section on frames."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

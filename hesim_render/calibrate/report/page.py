@@ -1,7 +1,5 @@
 """The calibration report: one HTML file that needs no other file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

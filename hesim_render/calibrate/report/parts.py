@@ -1,7 +1,5 @@
 """Common parts of the sections of the calibration report: lines of tables, findings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +22,7 @@ UPPER_OF_NONE = 3.0
 
 
 def counted(
-    axes: Axes, x: NDArray, events: NDArray, trials: NDArray, colour: str, label: str = "", size: float = 3.4
+    axes: "Axes", x: NDArray, events: NDArray, trials: NDArray, colour: str, label: str = "", size: float = 3.4
 ) -> None:
     """Rates as points. Where nothing was counted, a triangle points down from the 95 % limit: a logarithmic axis has no
     0.
@@ -42,7 +40,7 @@ def lowest(events: NDArray, trials: NDArray) -> float:
     return float((np.where(events > 0, events, UPPER_OF_NONE) / trials).min())
 
 
-def scale_from_dark(axes: Axes, darkest_lit: float) -> None:
+def scale_from_dark(axes: "Axes", darkest_lit: float) -> None:
     """A logarithmic axis of light, with the dark on it."""
     axes.set_xscale("symlog", linthresh=10 ** np.floor(np.log10(darkest_lit)), linscale=0.5)
 

@@ -1,7 +1,5 @@
 """Fixed maps of a device's frame pixels: PRNU, offset and dark current, from the device seed or measured."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -19,8 +19,6 @@ is added, and every variance here excludes its q²/12.
 Arrays are NumPy's or Dr.Jit's (`hesim_render.core.device_types`); nothing here draws a random number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -97,7 +95,7 @@ class Curve:
     full_scale_dn: float
 
     @classmethod
-    def of(cls, terms: Sequence[float] | None, full_scale_dn: float) -> Curve | None:
+    def of(cls, terms: Sequence[float] | None, full_scale_dn: float) -> "Curve | None":
         """The curve of a sensor file; None where there is none."""
         if terms is None:
             return None

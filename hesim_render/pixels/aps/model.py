@@ -3,8 +3,6 @@
 The formulas are in `hesim_render.pixels.aps.formulas`, the sampler is in `hesim_render.pixels.aps.sampler`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -62,7 +60,7 @@ class ApsNoise(PlainState):
         off = f"; off: {', '.join(sorted(self.off))}" if self.off else ""
         return f"<ApsNoise of the frame pixels of {self.layout!r}{off}>"
 
-    def without(self, *terms: str) -> ApsNoise:
+    def without(self, *terms: str) -> "ApsNoise":
         """The same model with terms of `APS_TERMS` switched off.
 
         ``shot`` is the noise of the light (β1, β3, β4), ``dark_current`` its mean and its noise (β2, β5),
@@ -77,7 +75,7 @@ class ApsNoise(PlainState):
         """
         return replace(self, off=switched_off(self.off, terms, APS_TERMS))
 
-    def clean(self) -> ApsNoise:
+    def clean(self) -> "ApsNoise":
         """Without any noise: black level, gain, full well, rounding and clipping remain."""
         return self.without(*APS_TERMS)
 

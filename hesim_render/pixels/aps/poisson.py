@@ -1,7 +1,5 @@
 """Exact Poisson deviates at every mean, on Dr.Jit."""
 
-from __future__ import annotations
-
 import math
 
 from hesim_render.core.backend import jit

@@ -1,7 +1,5 @@
 """Sampler of frame pixels on Dr.Jit. Values are drawn from the law of `hesim_render.pixels.aps.formulas`."""
 
-from __future__ import annotations
-
 import math
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -71,7 +69,7 @@ class DeviceMaps:
 
 
 def draw_dn(
-    noise: ApsNoise, maps: DeviceMaps, electrons: Float, exposure_us: float, seed: int, frame: int, first_pixel: int
+    noise: "ApsNoise", maps: DeviceMaps, electrons: Float, exposure_us: float, seed: int, frame: int, first_pixel: int
 ) -> UInt32:
     """Values of the pixels of a frame from `first_pixel` on, UInt32 [n], DN; see `ApsNoise.sample_dn`.
 

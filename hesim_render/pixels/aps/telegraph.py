@@ -5,8 +5,6 @@ of a pixel is taken when a frame begins, at frame / frame_rate_hz, and holds for
 levels over time is the pixel's own mean: offset and dark current do not change.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ step of the one is paired with a step of the other in the same direction, whiche
 in the same sequence cancel if neither has a partner by then: the pixel went back. What is left has no partner.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

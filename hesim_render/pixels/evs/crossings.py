@@ -1,7 +1,5 @@
 """Events of pixels whose levels go on paths of straight lines, on the host; one round has the next event of each."""
 
-from __future__ import annotations
-
 from typing import TypeAlias
 
 import numpy as np

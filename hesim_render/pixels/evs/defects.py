@@ -5,8 +5,6 @@ addition to those of its comparisons. The rates spread over decades, as noise ra
 flickering pixel does so only while a random telegraph signal is high (`hesim_render.pixels.poisson_points`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,7 +48,7 @@ class PixelDefects:
     firing_share: NDArray[np.float64]
     change_hz: NDArray[np.float64]
 
-    def without(self, term: str) -> PixelDefects:
+    def without(self, term: str) -> "PixelDefects":
         """The same defects without the stuck (``stuck``), hot (``hot``) or flickering (``flickering``) pixels."""
         if term == "stuck":
             return replace(self, stuck=self.stuck[:0])

@@ -1,7 +1,5 @@
 """The form of events: one structured array, in order of time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -80,7 +78,7 @@ class LabelBlock:
     clean: NDArray[np.void]
 
     @classmethod
-    def empty(cls) -> LabelBlock:
+    def empty(cls) -> "LabelBlock":
         """Nothing."""
         none = np.empty(0, np.uint8)
         return cls(none, np.empty(0, np.int64), none, no_events(), none, no_events())
@@ -107,7 +105,7 @@ class EventLabels:
         return f"<EventLabels of {self.label.size} events; {self.lost.size} lost, {self.clean.size} without noise>"
 
     @classmethod
-    def of(cls, blocks: Sequence[LabelBlock]) -> EventLabels:
+    def of(cls, blocks: Sequence[LabelBlock]) -> "EventLabels":
         """The labels of a whole run from all its blocks, which are in order of time."""
         every = [LabelBlock.empty(), *blocks]
         label = np.concatenate([block.label for block in every])

@@ -15,8 +15,6 @@ Arrays are NumPy's or Dr.Jit's (`hesim_render.core.device_types`), probabilities
 random number.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -50,7 +48,7 @@ class Coefficients:
     dark: Values
 
     @classmethod
-    def of(cls, beta: tuple[Values, ...], dn_per_signal: Values, law: ShotLaw, xp: Namespace) -> Coefficients:
+    def of(cls, beta: tuple[Values, ...], dn_per_signal: Values, law: ShotLaw, xp: Namespace) -> "Coefficients":
         """Coefficients from β1 … β5.
 
         Parameters
@@ -70,7 +68,7 @@ class Coefficients:
             dark=beta4**2,
         )
 
-    def each(self, change: Callable[[Values], Values]) -> Coefficients:
+    def each(self, change: Callable[[Values], Values]) -> "Coefficients":
         """The same with `change` applied to each coefficient: to select entries, convert the type or copy to the
         device.
         """

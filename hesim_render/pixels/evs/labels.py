@@ -12,8 +12,6 @@ back before (`partners`, `balance`). It is `signal` if the nominal threshold giv
 leak that drifts: at least half of the step), else `noise`.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import numpy as np

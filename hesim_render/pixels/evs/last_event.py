@@ -1,7 +1,5 @@
 """Asynchronous event pixels: each compares its level with that of its last event."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

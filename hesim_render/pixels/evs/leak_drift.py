@@ -12,8 +12,6 @@ The reference stays where it is, and all levels are taken as higher by the way o
 is kept in double precision, so that small steps of it are not lost.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

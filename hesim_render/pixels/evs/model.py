@@ -6,8 +6,6 @@ reference. r is the response of the reference's filter over that of the pixel's 
 pixel are drawn from the device seed, or measured.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -63,7 +61,7 @@ class EvsNoise(PlainState):
         off = f"; off: {', '.join(sorted(self.off))}" if self.off else ""
         return f"<EvsNoise of the event pixels of {self.layout!r}{off}>"
 
-    def without(self, *terms: str) -> EvsNoise:
+    def without(self, *terms: str) -> "EvsNoise":
         """The same model with terms of `EVS_TERMS` switched off.
 
         ``shot`` is β3, ``dark_current`` is β4 (its shot noise), ``mismatch`` the spread over pixels,
@@ -79,7 +77,7 @@ class EvsNoise(PlainState):
         """
         return replace(self, off=switched_off(self.off, terms, EVS_TERMS))
 
-    def clean(self) -> EvsNoise:
+    def clean(self) -> "EvsNoise":
         """The same model without any noise or limit: thresholds are nominal, ln x has no noise, every event is read."""
         return self.without(*EVS_TERMS)
 

@@ -14,8 +14,6 @@ noise events are more frequent. A pixel without a dead time moves its level of c
 each event, and leak events do not move it.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from pathlib import Path

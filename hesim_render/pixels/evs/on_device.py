@@ -1,7 +1,5 @@
 """Parameters of each event pixel on the device, for the event stage: thresholds, keys and coefficients."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from copy import copy
 
@@ -58,7 +56,7 @@ class EventPixels:
         self._reference_level: Float = None if reference_level is None else of_position(reference_level)
         self._noise_filter, self._bandwidth_hz = noise_filter, bandwidth_hz
 
-    def at(self, pixel: UInt32) -> EventPixels:
+    def at(self, pixel: UInt32) -> "EventPixels":
         """The same of some pixels."""
         some = copy(self)
         some.key = take(self.key, pixel)

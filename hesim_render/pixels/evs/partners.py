@@ -11,8 +11,6 @@ well if the level goes on from the same reference to that one before the pixel s
 itself, so that the two thresholds cannot drift apart however long the pixel runs.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -39,7 +37,7 @@ class _Waiting(NamedTuple):
     number: NDArray[np.int64]
     goal: NDArray[np.float64]
 
-    def at(self, which: NDArray) -> _Waiting:
+    def at(self, which: NDArray) -> "_Waiting":
         return _Waiting(*(values[which] for values in self))
 
 
@@ -260,7 +258,7 @@ class _WithDeadTime:
         self._stepped = np.ones(pixels, np.bool_)
 
     def take(
-        self, stage: EvsStage, electrons: Float, t_us: int, effects: PixelSteps, verdicts: _Verdicts
+        self, stage: EvsStage, electrons: Float, t_us: int, effects: PixelSteps, verdicts: "_Verdicts"
     ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         own = self._own.step(electrons, t_us)
         steps = as_steps(own, self._steps + np.arange(own.size), self._cols)

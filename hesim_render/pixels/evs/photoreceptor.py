@@ -12,8 +12,6 @@ every h. Both poles together are −3 dB at f_c, so that a = 2π f_c/√(√2 �
 whose corner rises with the photocurrent [graca2021] until its bias current limits it.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

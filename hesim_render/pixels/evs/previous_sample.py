@@ -1,7 +1,5 @@
 """Event pixels with a tick: each compares its level with that of the previous sample."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

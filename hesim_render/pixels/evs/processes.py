@@ -11,8 +11,6 @@ deviate of the pixel, r and c of `NoiseSpreadSpec`::
 with plus in odd rows and columns of the event grid of the full sensor. The noise keeps its variance.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -5,8 +5,6 @@ period the change amplifier is released, and the reference is the level of that 
 [lichtsteiner2008]. On a steady slope a pixel therefore fires every period + θ/slope.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

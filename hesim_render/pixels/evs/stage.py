@@ -6,8 +6,6 @@ sensor's own tick sets the sample times; in ``last_event`` mode the source may b
 The event read-out is a first-in, first-out buffer that a clocked bus empties.
 """
 
-from __future__ import annotations
-
 from typing import Any, Protocol
 
 import numpy as np
@@ -37,7 +35,7 @@ class Labels(Protocol):
 
     def take(
         self,
-        stage: EvsStage,
+        stage: "EvsStage",
         electrons: Float,
         events: NDArray[np.void],
         origin: NDArray[np.int8],

@@ -25,8 +25,6 @@ the visits to r times the mean wait there. Pixels wait longest where both thresh
 The law holds for rare crossings; where they are frequent, a few periods of the noise bring any law to the true one.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from itertools import product

@@ -1,7 +1,5 @@
 """A hyperspectral cube as a source of flux: each pixel sees it through its own filter, lit and moved as asked."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from math import ceil, hypot, log
 from pathlib import Path
@@ -52,7 +50,7 @@ class CubeFlux(WindowByWindow):
         If the cube cannot be read, does not cover a response, or holds reflectances outside 0 to 1.
     """
 
-    def __init__(self, source: str | Path | CubeFile, sensor: Sensor, options: CubeOptions) -> None:
+    def __init__(self, source: str | Path | CubeFile, sensor: Sensor, options: "CubeOptions") -> None:
         self.sensor, self.options = sensor, options
         self.cube = source if isinstance(source, CubeFile) else open_cube(Path(source), options.wavelength_nm)
         self.is_static = not options.is_moving
@@ -230,7 +228,7 @@ class CubeOptions(Strict):
     rotation_deg_per_s: float = Field(0.0, ge=-1e5, le=1e5)
 
     @model_validator(mode="after")
-    def _check(self) -> CubeOptions:
+    def _check(self) -> "CubeOptions":
         if self.quantity == "reflectance":
             if self.mean_luminance_cd_m2 is not None:
                 raise ValueError("mean_luminance_cd_m2 is for radiance; give reflectances illuminance_lux")
@@ -243,7 +241,7 @@ class CubeOptions(Strict):
         return self
 
     @classmethod
-    def of(cls, given: Mapping[str, object]) -> CubeOptions:
+    def of(cls, given: Mapping[str, object]) -> "CubeOptions":
         """Options from keywords.
 
         Raises

@@ -1,7 +1,5 @@
 """Integrals of a cube with spectra: one plane for each filter."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ its pixel's place s therefore goes on at p = s − δ, with δ drawn from the PS
 sums of independent δ. The PSF of a pixel is that of the image height of its centre.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from math import log, pi, sqrt
 

@@ -5,8 +5,6 @@ entrance pupil. The optical axis meets the chip at the centre of the *full* sens
 states (`Lens.axis_mm`). Positions on the chip are measured from that centre.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import atan2, degrees, radians, tan

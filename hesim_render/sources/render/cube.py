@@ -5,8 +5,6 @@ The files follow the OpenEXR layout of Fichet, Pacanowski and Wilkie [fichet2021
 ``emissiveUnits``. Compression is PIZ, which Mitsuba can read.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from itertools import pairwise

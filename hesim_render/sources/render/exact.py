@@ -1,7 +1,5 @@
 """The exact mode of the renderer as a source of flux: Φ of any mosaic pixels over any time slice."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """What the camera of a scene has in its picture, before anything is rendered."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass, replace
 

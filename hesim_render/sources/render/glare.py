@@ -4,8 +4,6 @@ With g that part, Φ' = (1 − g) Φ + g ⟨Φ⟩, where ⟨Φ⟩ is the mean ov
 read out, of what pixels with the same filter would get. Light from outside the picture is not part of it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -7,8 +7,6 @@ beyond it, the scene's own integrator is used.
 The levels of all lights of a scene at any time follow from its file.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from math import ceil, log2, pi
 from typing import Any

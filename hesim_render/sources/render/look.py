@@ -1,7 +1,5 @@
 """A quick picture of the framing of a scene: which surfaces the sensor sees, without light."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -3,8 +3,6 @@
 Camera space and positions on the chip are those of `camera`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

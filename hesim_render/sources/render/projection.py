@@ -7,8 +7,6 @@ first; the centre of the pixel in column 0 and row 0 is (0, 0), so that it cover
 distortion are in `hesim_render.sensor.distortion`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -45,7 +43,7 @@ class Projection:
     distortion: Distortion | None = None
 
     @classmethod
-    def of(cls, sensor: Sensor, region_mm: tuple[float, float, float, float] | None = None) -> Projection:
+    def of(cls, sensor: Sensor, region_mm: tuple[float, float, float, float] | None = None) -> "Projection":
         """The projection of a sensor with the lens in use.
 
         Parameters

@@ -1,7 +1,5 @@
 """Renderers of scenes: what a run needs of them, and the one of flickering lights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Protocol
 

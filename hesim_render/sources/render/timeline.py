@@ -1,7 +1,5 @@
 """Time slices of a moving scene, short enough that no object moves far within one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Paths from mosaic pixels into the scene, in blocks that bound memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Video from NumPy arrays: in memory, or a ``.npy`` file read piece by piece."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any

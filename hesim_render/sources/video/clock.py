@@ -1,7 +1,5 @@
 """Times of the pictures of a video, in simulated µs."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Meaning of a video's numbers: transfer, primaries, YUV matrix and range, from its tags or given."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
@@ -63,7 +61,7 @@ class ColourTags:
     range: Range | None = None
 
     @classmethod
-    def of_codes(cls, transfer: int, primaries: int, matrix: int, range: int, file: str) -> ColourTags:
+    def of_codes(cls, transfer: int, primaries: int, matrix: int, range: int, file: str) -> "ColourTags":
         """Tags from the codes of ITU-T H.273 that video files hold.
 
         Raises
@@ -84,7 +82,7 @@ class ColourTags:
             curve, gamma, _PRIMARIES_OF_CODE.get(primaries), _MATRIX_OF_CODE.get(matrix), _RANGE_OF_CODE.get(range)
         )
 
-    def with_given(self, **given: Any) -> ColourTags:
+    def with_given(self, **given: Any) -> "ColourTags":
         """The tags with given values in place of the file's; None keeps the file's value."""
         changes = {name: value for name, value in given.items() if value is not None}
         if "transfer" in changes and "gamma" not in changes:

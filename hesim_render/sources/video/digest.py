@@ -1,7 +1,5 @@
 """SHA-256 of a video's data, computed in parallel to the run; the manifest waits for it."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 from abc import ABC, abstractmethod

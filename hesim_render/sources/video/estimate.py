@@ -3,8 +3,6 @@
 What the rate of a video's pictures does to events, for the way in which the pixels compare.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Video from a file, decoded by PyAV as it is needed."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 from array import array

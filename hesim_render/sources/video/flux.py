@@ -1,7 +1,5 @@
 """A video as a source of flux: Φ of any mosaic pixels over any time interval."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any

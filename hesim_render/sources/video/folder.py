@@ -1,7 +1,5 @@
 """Video from a folder of numbered pictures: PNG, JPEG, TIFF, EXR and other formats that PyAV decodes."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

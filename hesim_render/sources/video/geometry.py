@@ -1,7 +1,5 @@
 """Mapping from picture to mosaic: the footprint of each mosaic pixel in the picture, and the mean over it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -11,8 +11,6 @@ response: that to one smooth surface among the many of this colour. The basis en
 constant beyond.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import pi
 

@@ -1,7 +1,5 @@
 """From the codes of a picture to linear light, in one kernel over the picture."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Motion-compensated pictures between those of a video, by libavfilter's minterpolate."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """All options of a video: one validated model, which goes into the manifest as it is."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field, ValidationError, model_validator
@@ -66,7 +64,7 @@ class VideoOptions(Strict):
     lens_shading: bool = False
 
     @model_validator(mode="after")
-    def _consistent(self) -> VideoOptions:
+    def _consistent(self) -> "VideoOptions":
         if self.white_lux is not None and self.white_e_per_s is not None:
             raise ValueError("white_lux and white_e_per_s: give one of them")
         if (self.white_e_per_s is None) != (self.white_filter is None):
@@ -78,7 +76,7 @@ class VideoOptions(Strict):
         return self
 
     @classmethod
-    def of(cls, **given: object) -> VideoOptions:
+    def of(cls, **given: object) -> "VideoOptions":
         """Options from keywords; those that are None count as not given.
 
         Raises

@@ -1,7 +1,5 @@
 """Memory layout of a picture, and the reader interface that supplies a video's pictures in order."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -60,7 +58,7 @@ class Timing:
     cut_short: str = ""
 
     @classmethod
-    def regular(cls, count: int, fps: float) -> Timing:
+    def regular(cls, count: int, fps: float) -> "Timing":
         return cls(np.arange(count) / fps, count / fps)
 
 

@@ -1,7 +1,5 @@
 """Pictures and streams through PyAV: their own planes, unchanged, in the few layouts that have formulas here."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

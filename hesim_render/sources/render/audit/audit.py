@@ -7,8 +7,6 @@ of its own, and so many rays that its error is a small part of the tolerance. Ev
 the whole run, at whatever number of units the audit stops (`confidence`).
 """
 
-from __future__ import annotations
-
 from itertools import chain
 from typing import Any
 

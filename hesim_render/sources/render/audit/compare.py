@@ -1,7 +1,5 @@
 """Compare the noise-free events of a run with those of a reference: missed and extra events, counted."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

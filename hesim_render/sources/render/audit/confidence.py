@@ -7,8 +7,6 @@ reached 1/α are therefore excluded with confidence 1 − α, at whatever time a
 [waudby2024]. A portfolio of several stakes is a valid bet as well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

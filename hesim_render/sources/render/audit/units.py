@@ -1,7 +1,5 @@
 """Units of the audit: values that a source gives for random pixels, noted while they are passed on."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -43,13 +41,13 @@ class Units:
     difference: NDArray[np.float64]
     error: NDArray[np.float64]
 
-    def at(self, place: NDArray) -> Units:
+    def at(self, place: NDArray) -> "Units":
         """Some of the units."""
         values = {name: getattr(self, name)[:, place] for name in _BY_WINDOW}
         return Units(pixel=self.pixel[place], core=self.core, **values)
 
     @classmethod
-    def joined(cls, parts: Sequence[Units]) -> Units:
+    def joined(cls, parts: "Sequence[Units]") -> "Units":
         """Join units of the same shape."""
         values = {name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in _BY_WINDOW}
         return cls(pixel=np.concatenate([part.pixel for part in parts]), core=parts[0].core, **values)

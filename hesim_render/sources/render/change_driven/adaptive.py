@@ -1,7 +1,5 @@
 """Adaptive rendering of listed pixels: pilot pass, plan, and the rays that the plan names."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

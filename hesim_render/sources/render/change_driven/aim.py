@@ -7,8 +7,6 @@ at the rays' own instants. The two are combined by the balance heuristic [veach1
 and q of the aimed rays, a ray of either kind has the weight W/(W/2 + q/2). The estimate is unbiased for any squares.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -49,7 +47,7 @@ class Aims:
     sites: int
 
     @classmethod
-    def of(cls, parts: Sequence[tuple[int, NDArray[np.int64], NDArray[np.int64]]], sites: int) -> Aims | None:
+    def of(cls, parts: Sequence[tuple[int, NDArray[np.int64], NDArray[np.int64]]], sites: int) -> "Aims | None":
         """Collect objects; None if there are none.
 
         Parameters
@@ -66,7 +64,7 @@ class Aims:
         key, first = np.unique(keys[order], return_index=True)
         return cls(key, np.append(first, order.size), group[order].astype(np.uint32), sites)
 
-    def at(self, window: NDArray[np.integer], site: NDArray[np.integer]) -> PairAims:
+    def at(self, window: NDArray[np.integer], site: NDArray[np.integer]) -> "PairAims":
         """The objects of listed pairs, [n]."""
         wanted = window.astype(np.int64) * self.sites + site
         # pairs that are not in the list have no objects; the sentinel −1 is no key
@@ -91,7 +89,7 @@ class PairAims:
     count: NDArray[np.uint32]
     group: NDArray[np.uint32]
 
-    def part(self, part: slice | NDArray) -> PairAims:
+    def part(self, part: slice | NDArray) -> "PairAims":
         """Those of some pairs."""
         return PairAims(self.first[part], self.count[part], self.group)
 
@@ -149,7 +147,7 @@ class LaneAims:
     is_aimed: Mask
 
     @classmethod
-    def of(cls, aims: PairAims, pair: UInt32, is_aimed: Mask) -> LaneAims:
+    def of(cls, aims: PairAims, pair: UInt32, is_aimed: Mask) -> "LaneAims":
         """Spread the objects of pairs over lanes.
 
         Parameters

@@ -1,7 +1,5 @@
 """Rays of each pair, from what the pilot saw of the pixel and of its neighbours."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

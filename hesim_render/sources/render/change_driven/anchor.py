@@ -3,8 +3,6 @@
 The anchor of a window depends on its time alone, so that a pixel has the same values in all runs.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

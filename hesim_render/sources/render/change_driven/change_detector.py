@@ -6,8 +6,6 @@ whose rays all see the same light: whatever comes is brighter or darker. Where r
 penumbra, a small change turns few of them, and such pixels are looked at with all pilot rays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 

@@ -5,8 +5,6 @@ is many times the noise of so dark a pixel. Without these looks nothing would te
 light would be a straight line from one end of the block to the other.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

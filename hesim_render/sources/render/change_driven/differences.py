@@ -9,8 +9,6 @@ which is unbiased for any m, because the rays that choose m are the pilot's. The
 are compared with the anchor of the block (`anchor`), all others with the first window.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,12 +37,12 @@ class Differences:
     controlled: NDArray[np.bool_]
     error: NDArray[np.float32]
 
-    def first(self) -> Differences:
+    def first(self) -> "Differences":
         """Those in the first window."""
         return Differences(self.rays[:1], self.controlled[:1], self.error[:1])
 
     @classmethod
-    def none(cls, windows: int, pixels: int) -> Differences:
+    def none(cls, windows: int, pixels: int) -> "Differences":
         """No differences."""
         shape = windows, pixels
         return cls(np.zeros(shape, np.int16), np.zeros(shape, np.bool_), np.zeros(shape, np.float32))

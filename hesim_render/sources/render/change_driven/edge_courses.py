@@ -10,8 +10,6 @@ with g the mean of the model over the pixel. Windows between them are not render
 both ends, so only what bends between them remains.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,7 +71,7 @@ class Courses:
     model: NDArray[np.float32]
 
     @classmethod
-    def none(cls) -> Courses:
+    def none(cls) -> "Courses":
         """No windows."""
         nothing = np.empty(0, np.int64)
         return cls(nothing, nothing, nothing, nothing, np.empty(0, np.float32))

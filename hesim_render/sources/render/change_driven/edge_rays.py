@@ -1,7 +1,5 @@
 """How many rays a pair needs, once decision rays have said whether it holds an edge."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Searches for the line between two sides of rays that has the widest gap, at rest or moving."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

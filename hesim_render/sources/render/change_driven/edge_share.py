@@ -1,7 +1,5 @@
 """Share of a pixel, or of a pixel in a window, on one side of a straight line."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

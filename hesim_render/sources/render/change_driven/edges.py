@@ -10,8 +10,6 @@ The line is fitted to *decision rays*, which are never part of the picture: the 
 from all of them, if there is one that separates those above the middle of their range from those below it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -55,14 +53,14 @@ class PairEdges:
     speed: NDArray[np.float32]
 
     @classmethod
-    def at(cls, count: int, place: NDArray[np.int64], models: PairEdges) -> PairEdges:
+    def at(cls, count: int, place: NDArray[np.int64], models: "PairEdges") -> "PairEdges":
         """Models of `count` pairs, of which those at some places have one."""
         padded = cls(*(np.zeros(count, np.float32) for _ in fields(cls)))
         for values, own in zip(astuple_of(padded), astuple_of(models), strict=True):
             values[place] = own
         return padded
 
-    def part(self, part: slice | NDArray) -> PairEdges:
+    def part(self, part: slice | NDArray) -> "PairEdges":
         """Those of some pairs."""
         return PairEdges(*(values[part] for values in astuple_of(self)))
 
@@ -78,7 +76,7 @@ class PairEdges:
         return low + (high - low) * moving_share(self.normal_x, self.normal_y, self.offset, self.speed)
 
 
-def astuple_of(values: PairEdges | EdgeFit) -> tuple[NDArray, ...]:
+def astuple_of(values: "PairEdges | EdgeFit") -> tuple[NDArray, ...]:
     """The arrays of a data class, without copies."""
     return tuple(getattr(values, each.name) for each in fields(values))
 
@@ -109,7 +107,7 @@ class EdgeFit:
     rays: NDArray[np.float32]
 
     @classmethod
-    def empty(cls, count: int) -> EdgeFit:
+    def empty(cls, count: int) -> "EdgeFit":
         """Fits to be filled in."""
         return cls(*(np.empty(count, np.float32) for _ in fields(cls)))
 
@@ -123,16 +121,16 @@ class EdgeFit:
         """True where a line separates two even levels."""
         return self.is_line & (self.fewer >= _LEAST_ON_A_SIDE)
 
-    def at(self, part: NDArray) -> EdgeFit:
+    def at(self, part: NDArray) -> "EdgeFit":
         """Fits of some pairs."""
         return EdgeFit(*(values[part] for values in astuple_of(self)))
 
-    def scaled(self, factor: NDArray[np.float32]) -> EdgeFit:
+    def scaled(self, factor: NDArray[np.float32]) -> "EdgeFit":
         """The same lines, their fluxes times a factor."""
         fluxes = {name: getattr(self, name) * factor for name in ("low", "high", "scatter")}
         return replace(self, **fluxes)
 
-    def replace(self, part: slice | NDArray[np.int64], fits: EdgeFit) -> None:
+    def replace(self, part: slice | NDArray[np.int64], fits: "EdgeFit") -> None:
         """Put in the fits of some pairs."""
         for values, fitted in zip(astuple_of(self), astuple_of(fits), strict=True):
             values[part] = fitted
@@ -233,7 +231,7 @@ class LaneEdges:
     is_strip: Mask
 
     @classmethod
-    def of(cls, edges: PairEdges, pair: UInt32, is_strip: Mask) -> LaneEdges:
+    def of(cls, edges: PairEdges, pair: UInt32, is_strip: Mask) -> "LaneEdges":
         """Spread the models of pairs over rays.
 
         Parameters

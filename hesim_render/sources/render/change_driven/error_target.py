@@ -1,7 +1,5 @@
 """Wanted error of a render, in units of the noise of the sensor's own pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Data of the default source: flux with both halves and its error, pixels at rest, and counts of the work done."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +24,7 @@ class Flux:
     error: NDArray[np.float32]
 
     @classmethod
-    def zeros(cls, windows: int, pixels: int) -> Flux:
+    def zeros(cls, windows: int, pixels: int) -> "Flux":
         """Flux 0 of all pixels in all windows."""
         return cls(*(np.zeros((windows, pixels), np.float32) for _ in range(3)))
 
@@ -34,11 +32,11 @@ class Flux:
     def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         return self.half_a, self.half_b, self.error
 
-    def at(self, place: slice | NDArray) -> Flux:
+    def at(self, place: slice | NDArray) -> "Flux":
         """Flux of the pixels at some places."""
         return Flux(*(values[:, place] for values in self.arrays))
 
-    def put(self, place: slice | NDArray, flux: Flux) -> None:
+    def put(self, place: slice | NDArray, flux: "Flux") -> None:
         """Set the flux of the pixels at some places."""
         for values, new in zip(self.arrays, flux.arrays, strict=True):
             values[:, place] = new

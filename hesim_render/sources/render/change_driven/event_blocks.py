@@ -5,8 +5,6 @@ have two of them, at both ends of the block. Only knots are held, so that a bloc
 windows.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import zip_longest
 
@@ -73,7 +71,7 @@ class Blocks:
         self._time: tuple[float, float] | None = None
         self._last = known
 
-    def take(self, block: Block) -> BlockFlux:
+    def take(self, block: Block) -> "BlockFlux":
         """Flux of the pixels that may change; with that of the others where few are constant."""
         renderer, windows = self._renderer, Windows(block.begin_us, block.end_us)
         # the block begins with the window that ended the one before, whose flux is known
@@ -141,7 +139,7 @@ class Knots:
     centre_us: NDArray[np.float64]
 
     @classmethod
-    def of(cls, flux: Flux, known: NDArray[np.bool_], centre_us: NDArray[np.float64]) -> Knots:
+    def of(cls, flux: Flux, known: NDArray[np.bool_], centre_us: NDArray[np.float64]) -> "Knots":
         """The known windows [window, pixel] of some pixels; the first window is among them."""
         # in order of pixel, then of window
         pixel, window = np.nonzero(known.T)

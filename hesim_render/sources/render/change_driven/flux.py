@@ -6,8 +6,6 @@ which windows of a pixel are interpolated (`plan`). Values that were rendered be
 time only: they would come out the same again.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace

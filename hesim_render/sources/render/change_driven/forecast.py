@@ -1,7 +1,5 @@
 """Forecast of the time and memory of a run, from pilot passes over a sample of the pixels."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +26,7 @@ _BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 14, 110, 60
 _BESIDE_S = 33e-9
 
 
-def forecast(source: ChangeDrivenFlux, demand: Demand) -> Estimate:
+def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
     """Forecast the time of the rays of a run, and its memory.
 
     Parameters
@@ -91,7 +89,7 @@ def forecast(source: ChangeDrivenFlux, demand: Demand) -> Estimate:
 
 
 def _sample(
-    pixel: NDArray[np.uint32], source: ChangeDrivenFlux, role: Role, rng: np.random.Generator
+    pixel: NDArray[np.uint32], source: "ChangeDrivenFlux", role: "Role", rng: np.random.Generator
 ) -> NDArray[np.uint32]:
     """Listed pixels in some small squares, which keep neighbours together, as in the run; single ones without
     neighbours.

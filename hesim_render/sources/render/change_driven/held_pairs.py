@@ -6,8 +6,6 @@ its gap; otherwise from the lower to the upper level. A pair whose interval, tog
 is narrow keeps the flux of that window in place of being rendered. Only the past decides, so the end of a run does not.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +34,7 @@ class HeldPairs:
     source: NDArray[np.int64]
 
     @classmethod
-    def none(cls) -> HeldPairs:
+    def none(cls) -> "HeldPairs":
         """No pairs."""
         nothing = np.empty(0, np.int64)
         return cls(nothing, nothing, nothing)

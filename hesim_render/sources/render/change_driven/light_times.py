@@ -5,8 +5,6 @@ times between which the waveform is nearly a straight line (`Waveform.follow_us`
 each part. The energy of each half of a part is exact.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,7 +39,7 @@ class LightParts:
     tilt: NDArray[np.float64]
 
     @classmethod
-    def of(cls, waveform: Waveform, begin_us: NDArray[np.float64], end_us: NDArray[np.float64]) -> LightParts:
+    def of(cls, waveform: Waveform, begin_us: NDArray[np.float64], end_us: NDArray[np.float64]) -> "LightParts":
         """Cut windows [w], µs. A window without any energy is one part of constant power."""
         knots = waveform.follow_us(float(begin_us.min()), float(end_us.max()))
         low, high = np.searchsorted(knots, begin_us, "right"), np.searchsorted(knots, end_us, "left")
@@ -88,7 +86,7 @@ class LightTimes:
     tilt: Float
 
     @classmethod
-    def of(cls, waveform: Waveform, begin_us: NDArray[np.float64], end_us: NDArray[np.float64]) -> LightTimes:
+    def of(cls, waveform: Waveform, begin_us: NDArray[np.float64], end_us: NDArray[np.float64]) -> "LightTimes":
         """Put windows [w], µs, on the device."""
         parts, types = LightParts.of(waveform, begin_us, end_us), jit()
         rows = np.stack([parts.energy_before, parts.energy, parts.begin_us, parts.length_us], axis=1)

@@ -1,7 +1,5 @@
 """In which windows the pilot looks with all its rays, and what sites show in the windows between two looks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """The pixels of a list and their neighbours."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -32,7 +30,7 @@ class Lattice:
     sensor_cols: int
 
     @classmethod
-    def whole(cls, rows: int, cols: int) -> Lattice:
+    def whole(cls, rows: int, cols: int) -> "Lattice":
         """All pixels of a sensor."""
         return cls(rows, cols, (0, 0), (1, 1), cols)
 
@@ -109,13 +107,13 @@ class Sites:
     _count: list[NDArray[np.float32]] = field(default_factory=list)
 
     @classmethod
-    def alone(cls, pixel: NDArray[np.uint32]) -> Sites:
+    def alone(cls, pixel: NDArray[np.uint32]) -> "Sites":
         """Listed pixels without neighbours, on no lattice."""
         index, listed = np.unique(pixel, return_inverse=True)
         return cls(index, listed.astype(np.int64))
 
     @classmethod
-    def around(cls, pixel: NDArray[np.uint32], lattice: Lattice) -> Sites:
+    def around(cls, pixel: NDArray[np.uint32], lattice: Lattice) -> "Sites":
         """Listed pixels with their neighbours up to `REACH` away, or, where they lie apart, with the next ones."""
         apart = lattice.step != (1, 1)
         reach = 1 if apart else REACH
@@ -144,7 +142,7 @@ class Sites:
     def size(self) -> int:
         return self.index.size
 
-    def only(self, some: NDArray[np.int64]) -> Sites:
+    def only(self, some: NDArray[np.int64]) -> "Sites":
         """The same sites, with some of the listed pixels as the list."""
         only = replace(self, listed=self.listed[some], _count=[])
         if not self.apart:

@@ -1,7 +1,5 @@
 """Rays of (pixel, time window) pairs, in packets. Each ray has its own instant inside the window of its pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

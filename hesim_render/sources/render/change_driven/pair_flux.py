@@ -1,7 +1,5 @@
 """Results of tracing pairs of a pixel and a window: flux, and the statistics of a pilot pass."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 
@@ -37,11 +35,11 @@ class PairFlux:
         return np.float32(0.5) * (self.half_a + self.half_b)
 
     @classmethod
-    def empty(cls, count: int) -> PairFlux:
+    def empty(cls, count: int) -> "PairFlux":
         """Flux to be filled in."""
         return cls(np.empty(count, np.float32), np.empty(count, np.float32), np.zeros(count, np.bool_))
 
-    def at(self, place: NDArray[np.int64]) -> PairFlux:
+    def at(self, place: NDArray[np.int64]) -> "PairFlux":
         """Flux of some pairs."""
         return PairFlux(self.half_a[place], self.half_b[place], self.met[place])
 
@@ -94,7 +92,7 @@ class PilotFlux:
     plain_change: NDArray[np.float32]
 
     @classmethod
-    def empty(cls, count: int) -> PilotFlux:
+    def empty(cls, count: int) -> "PilotFlux":
         """Statistics to be filled in."""
         controlled, plain, unshadowed, *others = (np.zeros(count, np.float32) for _ in range(7))
         return cls(controlled, plain, unshadowed, others[0], others[1], np.zeros(count, np.bool_), others[2], others[3])
@@ -108,7 +106,7 @@ class PilotFlux:
         met: UInt32,
         samples: int,
         alike: int,
-        before: tuple[PilotRays, NDArray[np.integer]] | None = None,
+        before: "tuple[PilotRays, NDArray[np.integer]] | None" = None,
         mild: bool = False,
     ) -> None:
         """Put in the statistics of pairs.

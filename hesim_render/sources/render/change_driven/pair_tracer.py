@@ -1,7 +1,5 @@
 """Flux of (pixel, time window) pairs in any order. Each ray has its own instant inside the window of its pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial

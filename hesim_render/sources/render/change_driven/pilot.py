@@ -5,8 +5,6 @@ final render happen to miss [kirk1991]. The pilot rays are the same at all times
 a change of the scene, not of the rays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property

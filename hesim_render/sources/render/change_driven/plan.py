@@ -1,7 +1,5 @@
 """The plan of a block of windows: which windows of a pixel are rendered, and which are interpolated."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,7 +88,7 @@ class Plan:
     pilot: NDArray[np.float32]
     aims: Aims | None = None
 
-    def until(self, window: int) -> Plan:
+    def until(self, window: int) -> "Plan":
         """The plan without the pairs on which no value up to a window depends.
 
         The last block of a run goes beyond its end, since blocks are the same for all runs. Of each pixel, the first
@@ -108,13 +106,13 @@ class Plan:
             fitted=np.concatenate([self.fitted[:window], fitted]),
         )
 
-    def without(self, window: NDArray[np.int64], pixel: NDArray[np.int64]) -> Plan:
+    def without(self, window: NDArray[np.int64], pixel: NDArray[np.int64]) -> "Plan":
         """The plan, some pairs of which are not rendered."""
         rendered = self.rendered.copy()
         rendered[window, pixel] = False
         return replace(self, rendered=rendered)
 
-    def first(self) -> Plan:
+    def first(self) -> "Plan":
         """The plan of the first window alone."""
         names = "rendered", "rays", "controlled", "error", "wanted", "floor", "fitted", "barred", "asked", "pilot"
         first = {name: getattr(self, name)[:1] for name in names}

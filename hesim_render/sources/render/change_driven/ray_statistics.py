@@ -4,8 +4,6 @@ One kernel goes through the rays of each pair, in order. With a kernel for each 
 the time of a pilot pass.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

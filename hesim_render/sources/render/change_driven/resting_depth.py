@@ -1,7 +1,5 @@
 """How near the resting surfaces in view are."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hesim_render.core.backend import jit

@@ -1,7 +1,5 @@
 """Reference values of the audit: pairs traced again, with a stream of random numbers of their own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import astuple
 

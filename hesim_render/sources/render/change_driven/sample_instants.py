@@ -1,7 +1,5 @@
 """Sample instants of an asynchronous sensor, dense enough to follow all motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import ceil
 

@@ -7,8 +7,6 @@ Outlines hold for every instant of a window (`motion_bounds`). The number of ray
 the read-out region.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

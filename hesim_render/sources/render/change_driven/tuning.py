@@ -11,8 +11,6 @@ All constants were judged on the scenes of `tests/support/random_scenes.py` and 
 None was chosen on the random scenes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from math import ceil, log2
 
@@ -191,7 +189,7 @@ class Tuning:
     edge_least_audit_rays: int = 1024
     most_audit_times: int = 4
 
-    def at(self, quality: float) -> Tuning:
+    def at(self, quality: float) -> "Tuning":
         """The constants for a quality: a better one than 0.5 moves the largest number of rays of a pair."""
         moved = self.most_rays << ceil(max(0.0, 2 * log2(_QUALITY / quality)))
         return replace(self, most_rays=max(self.most_rays, min(moved, self.most_fine_rays)))

@@ -1,7 +1,5 @@
 """Windows of time, on the host and on the device."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -82,7 +80,7 @@ class Moments:
         tracks: Sequence[Trajectory],
         boxes_of: Callable[[tuple[tuple[float, float], ...]], NDArray[np.float32]],
         waveform: Waveform | None = None,
-    ) -> Moments:
+    ) -> "Moments":
         """Put windows on the device.
 
         Parameters

@@ -16,8 +16,6 @@ if the instant is drawn separately (0.37 instead of 0.6 times the error of indep
 Padding of low-dimensional sequences: [kollig2002]; permutation: [kensler2013]; hash: lowbias32 of [wellons2018].
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 
@@ -209,10 +207,10 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
             light = mi.Point2f(_unit(x ^ (bits[1] * _ODD)), _unit(y ^ (bits[2] * _ODD)))
             return place, _unit(self._third(point) ^ bits[3]), light, self.next_1d()
 
-        def fork(self) -> CounterSampler:
+        def fork(self) -> "CounterSampler":
             return self
 
-        def clone(self) -> CounterSampler:
+        def clone(self) -> "CounterSampler":
             return self
 
         def seed(self, *_: Any) -> None:

@@ -1,7 +1,5 @@
 """Wavelengths of a ray, importance-sampled from the response of its pixel: filter × QE × λ."""
 
-from __future__ import annotations
-
 import functools
 import operator
 from collections.abc import Mapping

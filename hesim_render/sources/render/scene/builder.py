@@ -1,7 +1,5 @@
 """Build a Mitsuba scene with movable objects from a scene file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Meshes that change their shape: positions of their vertices at any time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,7 +34,7 @@ class Deformation:
         """Time from the first shape to the last, µs."""
         return float(self.knots_us[-1] - self.knots_us[0])
 
-    def part(self, vertices: slice) -> Deformation:
+    def part(self, vertices: slice) -> "Deformation":
         """The same of some of the vertices."""
         return replace(self, vertices_m=self.vertices_m[:, vertices])
 

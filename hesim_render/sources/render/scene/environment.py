@@ -1,7 +1,5 @@
 """Environment maps: light from everywhere, as a picture of all directions, with a level on a plane."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

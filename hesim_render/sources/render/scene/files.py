@@ -4,8 +4,6 @@ Mitsuba opens files where it finds them: in folders that a scene may add to, or 
 an XML file are followed as Mitsuba 3.9 follows them, and whatever it is about to open is checked before.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

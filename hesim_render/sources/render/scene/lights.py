@@ -1,7 +1,5 @@
 """Absolute emitters: radiance, intensity or irradiance of a light from its level on a stated plane."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import pi
 from typing import Any

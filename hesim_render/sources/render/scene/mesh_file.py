@@ -1,7 +1,5 @@
 """Objects from mesh files: OBJ and PLY by Mitsuba, STL, GLB and glTF by trimesh."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scenes in Mitsuba's own formats: an XML file, a built-in scene, or a dictionary, and the camera in them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import radians, tan
@@ -52,7 +50,7 @@ class MitsubaScene:
     integrator: MitsubaObject
     integrator_plugin: dict[str, Any] | None
     exact_because: str | None
-    camera: MitsubaCamera | None
+    camera: "MitsubaCamera | None"
 
 
 def load_mitsuba(mi: MitsubaModule, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
@@ -174,7 +172,7 @@ class MitsubaCamera:
     near_m: float
 
     @classmethod
-    def of(cls, mi: MitsubaModule, scene: MitsubaObject, used: Used) -> MitsubaCamera:
+    def of(cls, mi: MitsubaModule, scene: MitsubaObject, used: Used) -> "MitsubaCamera":
         """The first sensor of a loaded scene.
 
         Parameters

@@ -4,8 +4,6 @@ Mitsuba 3.10 renames the data of meshes: this module contains all code that this
 ``tests/sources/render/test_mitsuba_names.py`` lists the names.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Trajectories of a scene's objects and camera, with the motion of their parents in them."""
 
-from __future__ import annotations
-
 import json
 from functools import lru_cache
 from math import lcm

@@ -1,7 +1,5 @@
 """A scene as Mitsuba's parser has read it: what it names is checked before it is built."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Pictures of targets and surfaces as textures of Mitsuba."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

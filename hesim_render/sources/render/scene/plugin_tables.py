@@ -5,8 +5,6 @@ A few plugins belong to the sensor file, so their settings are ignored. Plugins 
 loaded, so a scene file cannot name a library to run.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The plugins of a parsed Mitsuba scene: their places, and what follows from the tables of `plugin_tables`."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The spectra that a scene file names, and the wavelengths that these must cover."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 from hesim_render.core.errors import SpecError

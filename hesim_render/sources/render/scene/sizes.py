@@ -1,7 +1,5 @@
 """Sizes that files state in their headers: Mitsuba takes memory for what a header says, before it reads the rest."""
 
-from __future__ import annotations
-
 import re
 import warnings
 import zlib

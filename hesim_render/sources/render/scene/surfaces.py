@@ -1,7 +1,5 @@
 """Surfaces of a scene file's objects: paint, pictures, and materials of Mitsuba."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Keyframed rigid poses on the device, per lane, for several tracks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -26,7 +24,7 @@ class DevicePose:
     shift: Vector3
 
     @classmethod
-    def about(cls, w: Float, v: Vector3, pivot: Point3, shift: Vector3) -> DevicePose:
+    def about(cls, w: Float, v: Vector3, pivot: Point3, shift: Vector3) -> "DevicePose":
         """x → R (x − pivot) + pivot + shift, R from the unit quaternion (w, v)."""
         x, y, z = v
         vector = type(v)
@@ -41,11 +39,11 @@ class DevicePose:
         return cls(rest.columns, shift + pivot - rest.turn_to_world(pivot))
 
     @classmethod
-    def none(cls, vector: type[Vector3]) -> DevicePose:
+    def none(cls, vector: type[Vector3]) -> "DevicePose":
         """The identity."""
         return cls((vector(1, 0, 0), vector(0, 1, 0), vector(0, 0, 1)), dr.zeros(vector))
 
-    def where(self, condition: Mask, other: DevicePose) -> DevicePose:
+    def where(self, condition: Mask, other: "DevicePose") -> "DevicePose":
         """This pose in lanes where a condition holds, `other` in the rest."""
         columns = (dr.select(condition, a, b) for a, b in zip(self.columns, other.columns, strict=True))
         return DevicePose(tuple(columns), dr.select(condition, self.shift, other.shift))
@@ -69,7 +67,7 @@ class DevicePose:
 class Tracks:
     """Tracks of several objects in tables, so that one kernel serves any number of them."""
 
-    def __init__(self, trajectories: Sequence[Trajectory]) -> None:
+    def __init__(self, trajectories: "Sequence[Trajectory]") -> None:
         types = jit()
         rows: list[NDArray[np.float64]] = []
         times: list[NDArray[np.float64]] = []

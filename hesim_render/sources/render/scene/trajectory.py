@@ -1,7 +1,5 @@
 """Keyframed rigid poses: the pose of an object or of the camera at any time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise

@@ -4,8 +4,6 @@ Mitsuba sums them on all threads, in an order that differs from build to build, 
 computed here in a fixed order instead, by the same weights.
 """
 
-from __future__ import annotations
-
 import mmap
 import re
 import struct

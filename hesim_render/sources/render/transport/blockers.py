@@ -5,8 +5,6 @@ and they need no more than whether anything is in the way. What a ray from the c
 `closed_form`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -59,7 +57,7 @@ class Blockers:
         dr.make_opaque(self._boxes, self._faces)
 
     @classmethod
-    def of(cls, mi: MitsubaModule, scene: MitsubaObject, balls: Sequence[tuple[Point3, Float]]) -> Blockers:
+    def of(cls, mi: MitsubaModule, scene: MitsubaObject, balls: Sequence[tuple[Point3, Float]]) -> "Blockers":
         """The shapes of a scene, with some balls that it does not hold."""
         shapes = scene.shapes()
         # a GPU has units of its own for triangles, and times were not compared

@@ -7,8 +7,6 @@ shapes, or with shapes of another form, are intersected by Mitsuba (Embree on a 
 balls if these are few. Mitsuba evaluates the reflection of all surfaces.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -61,7 +59,7 @@ class SimpleForm:
     meshes: list[MitsubaObject]
 
     @classmethod
-    def of(cls, mi: MitsubaModule, scene: MitsubaObject) -> SimpleForm | None:
+    def of(cls, mi: MitsubaModule, scene: MitsubaObject) -> "SimpleForm | None":
         """The faces and balls of a scene, or its sheets; None if it has other shapes, or too many."""
         shapes = scene.shapes()
         balls = [shape for shape in shapes if shape.class_name() == "Sphere"]

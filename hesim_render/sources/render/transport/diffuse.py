@@ -19,8 +19,6 @@ A path tracer with multiple importance sampling [veach1997] estimates the produc
 dark side of a penumbra its error was three times as large, with more rays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from math import pi
 

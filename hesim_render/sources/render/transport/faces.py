@@ -1,7 +1,5 @@
 """Flat faces of meshes: parallelograms of two triangles each."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Intersections of rays with balls and faces, in closed form."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from hesim_render.core.device import dr

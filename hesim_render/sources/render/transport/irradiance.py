@@ -1,7 +1,5 @@
 """Irradiance by a Lambertian rectangle in closed form, on the device."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

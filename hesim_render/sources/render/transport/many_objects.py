@@ -7,8 +7,6 @@ asks for none of its members. Bunches save time only: where two surfaces are equ
 number counts, so that the order of the tests does not matter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -6,8 +6,6 @@ around the images instead. The density of all directions is that of the mixture:
 with the balance heuristic ([veach1997], section 9.2.4). The estimate is unbiased whatever such a ray hits.
 """
 
-from __future__ import annotations
-
 from math import pi
 
 import numpy as np
@@ -54,7 +52,7 @@ class LampImages:
         dr.make_opaque(self._images)
 
     @classmethod
-    def of(cls, mi: MitsubaModule, scene: MitsubaObject) -> LampImages:
+    def of(cls, mi: MitsubaModule, scene: MitsubaObject) -> "LampImages":
         """Images of the area lights of a Mitsuba scene in its flat, perfectly reflecting shapes."""
         lamps = [shape.bbox() for shape in scene.shapes() if shape.is_emitter()]
         images: list[Image] = []
@@ -76,7 +74,7 @@ class LampImages:
     def __len__(self) -> int:
         return len(self._images)
 
-    def seen_from(self, point: Point3, upwards: Vector3, active: Mask) -> Cones:
+    def seen_from(self, point: Point3, upwards: Vector3, active: Mask) -> "Cones":
         """Cones of directions from surface points to the images that can light them.
 
         Parameters

@@ -6,8 +6,6 @@ and the angle δ. A box around a point's positions at two instants, widened by t
 at all instants in between.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from math import ceil, cos, pi

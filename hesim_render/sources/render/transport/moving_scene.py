@@ -9,8 +9,6 @@ Objects are tested only against rays that meet the box which contains the object
 (`Moment.boxes`). For other rays, not even the pose is computed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -5,8 +5,6 @@ body, face by face. Direct light takes these shares as a control variate (`trans
 correct what the outlines do not describe, such as holes, other forms, and two outlines behind each other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import pi

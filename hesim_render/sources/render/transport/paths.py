@@ -6,8 +6,6 @@ because it follows a path through one scene at one time. This one has two additi
 the images of lamps in flat mirrors (`LampImages`), and a uniform sky is not sampled (`spare_even_skies`).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

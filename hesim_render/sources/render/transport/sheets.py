@@ -5,8 +5,6 @@ within the kernel. This pays where triangles are long and thin and lie askew, as
 overlap, so that a tree of boxes excludes little.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

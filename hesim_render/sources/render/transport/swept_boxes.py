@@ -1,7 +1,5 @@
 """Start times of rays, and boxes that contain moving objects during a window."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Boxes around objects, in the picture and in space."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Rays run through the same `MovingScene` as those of the renderer, so that object
 them at every instant. Directions and positions are computed in float64 from the distance that Mitsuba finds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

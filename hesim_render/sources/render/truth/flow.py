@@ -6,8 +6,6 @@ row = y(t(row)), which is solved by fixed-point iteration. It contracts as long 
 slowly than the shutter.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

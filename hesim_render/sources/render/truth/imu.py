@@ -8,8 +8,6 @@ velocity, also where a track changes its velocity at once, as at keyframes.
 Noise is that of the usual model: white noise, and a bias that walks at random [burri2016].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -5,8 +5,6 @@ light comes from everywhere; so shadows, highlights, lamps that flicker and nois
 is the mean over nine rays through its square.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

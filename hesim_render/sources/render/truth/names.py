@@ -1,7 +1,5 @@
 """Names and numbers of objects, instances and materials of a scene."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +37,7 @@ class Names:
     _of_material: NDArray[np.uint16]
 
     @classmethod
-    def of(cls, mi: MitsubaModule, built: BuiltScene, parts: MovingScene) -> Names:
+    def of(cls, mi: MitsubaModule, built: BuiltScene, parts: MovingScene) -> "Names":
         """Names of a loaded scene."""
         objects, instances, materials = [NOTHING], [NOTHING], [NOTHING]
         object_of, of_shape, of_material = [0], {0: 0}, {0: 0}

@@ -3,8 +3,6 @@
 Public poses have the axes that computer vision uses: x to the right of the image, y downwards, z along the view.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

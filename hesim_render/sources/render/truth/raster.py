@@ -1,7 +1,5 @@
 """Places at which truth is given: all mosaic pixels of a region, or its event pixels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -32,7 +30,7 @@ class Raster:
     step: tuple[float, float]
 
     @classmethod
-    def of(cls, sensor: Sensor, grid: str) -> Raster:
+    def of(cls, sensor: Sensor, grid: str) -> "Raster":
         """The mosaic (``mosaic``) or the event grid (``events``) of a sensor.
 
         Raises

@@ -1,7 +1,5 @@
 """Several cameras that move together: the scene as each of them sees it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Geometric truth of a scene at any time: one call for each kind."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """What each pixel's chief ray meets: distance, normal, shape and material, and whether the pixel is mixed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
