@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, PositiveInt, field_validator, model_validator
 
 from hesim_render.core.errors import SpecError
-from hesim_render.specs.files import Strict, read_spec
+from hesim_render.specs.files import NamedSpec, Strict, read_spec
 
 #: Splits, in the order in which scenes are assigned to them.
 SPLITS = ("train", "val", "test")
@@ -188,12 +188,10 @@ class SplitShares(Strict):
         return self
 
 
-class BenchmarkSpec(Strict):
+class BenchmarkSpec(NamedSpec):
     """A whole benchmark: scenes × motions × lights × sensors × exposures × noise × seeds."""
 
-    schema_version: Literal[1]
     name: str = Field(pattern=f"^{NAME}$")
-    description: str
     seed: int = Field(1, ge=0, lt=2**63, description="of all draws of scenes, motions, lights and exposures")
     duration_s: float = Field(0.1, gt=0, le=3600)
     scenes: ScenesSpec

@@ -3,9 +3,9 @@
 from abc import ABC, abstractmethod
 from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from hesim_render.specs.geometry import Size
+from hesim_render.specs.geometry import Size, below
 from hesim_render.specs.light import LampSpec
 from hesim_render.specs.reflectance import PlacedTarget, ReflectanceSpec, TwoToneTarget
 from hesim_render.specs.spectrum import SpectrumSpec
@@ -58,11 +58,7 @@ class CharucoTarget(_Board):
     dictionary: str = Field("DICT_5X5_250", description="name of a dictionary of OpenCV")
     first_id: int = Field(0, ge=0, le=100_000)
 
-    @model_validator(mode="after")
-    def _inside(self) -> "CharucoTarget":
-        if self.marker_m >= self.square_m:
-            raise ValueError("marker_m must be below square_m")
-        return self
+    _inside = below("marker_m", "square_m")
 
     @property
     def pattern_m(self) -> tuple[float, float]:
@@ -104,11 +100,7 @@ class CircleGridTarget(_Board):
     diameter_m: Size = 0.015
     asymmetric: bool = False
 
-    @model_validator(mode="after")
-    def _apart(self) -> "CircleGridTarget":
-        if self.diameter_m >= self.pitch_m:
-            raise ValueError("diameter_m must be below pitch_m")
-        return self
+    _apart = below("diameter_m", "pitch_m")
 
     @property
     def pattern_m(self) -> tuple[float, float]:
@@ -142,11 +134,7 @@ class LedGridTarget(_Board, LampSpec):
     luminance_cd_m2: float = Field(500.0, ge=0, le=1e9, description="of the lamps, time mean")
     light: ReflectanceSpec = SpectrumSpec(flat=0.05)
 
-    @model_validator(mode="after")
-    def _apart(self) -> "LedGridTarget":
-        if self.diameter_m >= self.pitch_m:
-            raise ValueError("diameter_m must be below pitch_m")
-        return self
+    _apart = below("diameter_m", "pitch_m")
 
     @property
     def pattern_m(self) -> tuple[float, float]:

@@ -13,16 +13,10 @@ from pydantic import (
     model_validator,
 )
 
-from hesim_render.specs.geometry import Size
+from hesim_render.specs.files import InFolder
+from hesim_render.specs.geometry import Size, below
 from hesim_render.specs.light import LampSpec
-from hesim_render.specs.reflectance import (
-    InFolder,
-    PictureFile,
-    PlacedTarget,
-    ReflectanceSpec,
-    SizedTarget,
-    TwoToneTarget,
-)
+from hesim_render.specs.reflectance import PictureFile, PlacedTarget, ReflectanceSpec, SizedTarget, TwoToneTarget
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectral.patches import read_patches
 from hesim_render.spectral.spectrum import Spectrum, colorchecker_reflectances
@@ -106,11 +100,7 @@ class StepWedgeTarget(SizedTarget):
     reflectance_min: float = Field(0.01, gt=0, le=1)
     reflectance_max: float = Field(0.9, gt=0, le=1)
 
-    @model_validator(mode="after")
-    def _order(self) -> "StepWedgeTarget":
-        if self.reflectance_min >= self.reflectance_max:
-            raise ValueError("reflectance_min must be below reflectance_max")
-        return self
+    _order = below("reflectance_min", "reflectance_max")
 
 
 class GreyRampTarget(SizedTarget):
@@ -120,11 +110,7 @@ class GreyRampTarget(SizedTarget):
     reflectance_min: float = Field(0.0, ge=0, le=1)
     reflectance_max: float = Field(0.9, gt=0, le=1)
 
-    @model_validator(mode="after")
-    def _order(self) -> "GreyRampTarget":
-        if self.reflectance_min >= self.reflectance_max:
-            raise ValueError("reflectance_min must be below reflectance_max")
-        return self
+    _order = below("reflectance_min", "reflectance_max")
 
 
 class DeadLeavesTarget(SizedTarget):
@@ -143,12 +129,11 @@ class DeadLeavesTarget(SizedTarget):
     texels_across: int = Field(2048, ge=16, le=16384)
     seed: int = Field(1, ge=0, lt=2**63)
 
+    _radii = below("radius_min_m", "radius_max_m")
+    _order = below("reflectance_min", "reflectance_max")
+
     @model_validator(mode="after")
-    def _order(self) -> "DeadLeavesTarget":
-        if self.radius_min_m >= self.radius_max_m:
-            raise ValueError("radius_min_m must be below radius_max_m")
-        if self.reflectance_min >= self.reflectance_max:
-            raise ValueError("reflectance_min must be below reflectance_max")
+    def _visible(self) -> "DeadLeavesTarget":
         if self.radius_min_m < self.width_m / self.texels_across:
             raise ValueError("texels_across: the smallest leaves must have a radius of a texel or more")
         return self
@@ -170,11 +155,7 @@ class IntegratingSphereTarget(PlacedTarget, LampSpec):
     plate_m: Size = Field(0.15, description="side of the square plate around the port")
     luminance_cd_m2: float = Field(1000.0, ge=0, le=1e9, description="of the port, time mean")
 
-    @model_validator(mode="after")
-    def _inside(self) -> "IntegratingSphereTarget":
-        if self.port_diameter_m >= self.plate_m:
-            raise ValueError("port_diameter_m must be below plate_m")
-        return self
+    _inside = below("port_diameter_m", "plate_m")
 
     @property
     def width_m(self) -> float:

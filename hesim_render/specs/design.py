@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from hesim_render.specs.files import Strict
-from hesim_render.specs.study import NamedLight, NamesFiles, SetUseSpec, SurfacesSpec
+from hesim_render.specs.study import NamedLight, NamesFiles, SetUseSpec, SurfacesSpec, TaskFile
 
 _Lux = Annotated[float, Field(gt=0, le=1e9)]
 _Side = Annotated[int, Field(ge=1, le=12)]
@@ -37,12 +37,9 @@ class DesignLightsSpec(NamesFiles):
         return SurfacesSpec.model_validate({"reflectances": self.reflectances}, context={"folder": self.folder})
 
 
-class DesignSpec(NamesFiles):
+class DesignSpec(TaskFile):
     """A filter design."""
 
-    schema_version: Literal[1]
-    name: str = Field(min_length=1)
-    description: str = ""
     sensor: str
     filter_set: SetUseSpec
     palette: str = Field("dyes", description="filters to start from, filters that are not varied, quantum efficiency")

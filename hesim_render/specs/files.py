@@ -7,10 +7,18 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import CoreSchema, core_schema
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
@@ -69,6 +77,38 @@ class Strict(BaseModel):
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return _with_true_numbers(handler(source))
+
+
+def text_means(*keys: str) -> Any:
+    """A check of a model: a text in its place is the value of these keys."""
+
+    def check(cls: type[BaseModel], data: Any) -> Any:
+        return dict.fromkeys(keys, data) if isinstance(data, str) else data
+
+    return model_validator(mode="before")(classmethod(check))
+
+
+class InFolder(Strict):
+    """Content that names files relative to the folder of the file itself."""
+
+    folder: Path = Field(Path(), exclude=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _where_it_lies(cls, data: Any, info: ValidationInfo) -> Any:
+        if isinstance(data, dict) and info.context:
+            if "folder" in data:
+                raise ValueError("unknown key 'folder'")
+            data = {**data, "folder": info.context["folder"]}
+        return data
+
+
+class NamedSpec(Strict):
+    """What the files of scenes, sensors, palettes and filter sets begin with."""
+
+    schema_version: Literal[1]
+    name: str = Field(min_length=1)
+    description: str
 
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -5,12 +5,12 @@ may replace the quantum efficiency, so that all sets of one palette stand before
 """
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
 from hesim_render.core.errors import did_you_mean
-from hesim_render.specs.files import Strict, read_spec
+from hesim_render.specs.files import NamedSpec, read_spec
 from hesim_render.specs.sensor import EvsGridSpec, PixelSpec, tile_text
 from hesim_render.specs.spectrum import SpectrumSpec
 
@@ -18,12 +18,9 @@ from hesim_render.specs.spectrum import SpectrumSpec
 SETS, PALETTES = "filter_sets", "palettes"
 
 
-class PaletteSpec(Strict):
+class PaletteSpec(NamedSpec):
     """Filters by name."""
 
-    schema_version: Literal[1]
-    name: str = Field(min_length=1)
-    description: str
     quantum_efficiency: SpectrumSpec | None = Field(None, description="replaces that of the sensor")
     filters: dict[str, SpectrumSpec] = Field(min_length=1, description="transmittance of each filter")
     sources: dict[str, str] = {}
@@ -44,12 +41,9 @@ class PaletteSpec(Strict):
         return self
 
 
-class FilterSetSpec(Strict):
+class FilterSetSpec(NamedSpec):
     """A tile, and what its letters mean."""
 
-    schema_version: Literal[1]
-    name: str = Field(min_length=1)
-    description: str
     tile: str
     pixels: dict[str, PixelSpec] = Field(min_length=1)
     evs_grid: EvsGridSpec | None = None

@@ -1,7 +1,7 @@
 """Vectors, rigid poses and regions in files."""
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,17 @@ Coordinate = Annotated[float, Field(ge=-LARGEST_M, le=LARGEST_M)]
 Size = Annotated[float, Field(ge=SMALLEST_M, le=LARGEST_M)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
+
+
+def below(least: str, most: str) -> Any:
+    """A check of a model: the value of one key is below that of another."""
+
+    def check(model: Strict) -> Strict:
+        if getattr(model, least) >= getattr(model, most):
+            raise ValueError(f"{least} must be below {most}")
+        return model
+
+    return model_validator(mode="after")(check)
 
 
 class Region(Strict):

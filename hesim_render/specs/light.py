@@ -9,9 +9,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from hesim_render.specs.files import Strict
+from hesim_render.specs.files import InFolder, Strict
 from hesim_render.specs.geometry import Direction, Size, Vector
-from hesim_render.specs.reflectance import InFolder
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectral import waveform
 from hesim_render.spectral.spectrum import Spectrum, scale_to_irradiance, scale_to_lux, summed

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from hesim_render.core.errors import SpecError
-from hesim_render.specs.files import Strict
+from hesim_render.specs.files import InFolder, Strict
 from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation_about, rotation_vectors
-from hesim_render.specs.reflectance import InFolder
 from hesim_render.trajectories.pose_files import PoseFile, read_poses
 
 #: Keys of a track that say how its `file` is read, and the texts that they may be; without any, whole numbers.

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from hesim_render.specs.benchmark import NAME, SensorChoice
-from hesim_render.specs.files import Strict, locate, read_spec
+from hesim_render.specs.files import NamedSpec, Strict, locate, read_spec
 
 Rate = Annotated[float, Field(ge=1, le=1e6)]
 
@@ -26,12 +26,10 @@ class Peer(Strict):
     timeout_s: float = Field(3600, gt=0, le=1e6)
 
 
-class PeersSpec(Strict):
+class PeersSpec(NamedSpec):
     """Scenes that our sensor and all peers see in the same light."""
 
-    schema_version: Literal[1]
     name: str = Field(pattern=f"^{NAME}$")
-    description: str
     scenes: tuple[str, ...] = Field(min_length=1, description="names of shipped scenes, or paths relative to this file")
     sensor: SensorChoice
     duration_s: float = Field(0.1, gt=0, le=60)

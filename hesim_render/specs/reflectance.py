@@ -4,12 +4,11 @@ Surfaces of objects: pictures on them, and materials of Mitsuba by name.
 """
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
 
-from hesim_render.specs.files import Strict
+from hesim_render.specs.files import InFolder, Strict
 from hesim_render.specs.geometry import Direction, Size, Vector
 from hesim_render.specs.spectrum import SpectrumSpec
 
@@ -22,21 +21,6 @@ def _diffuse(spec: SpectrumSpec) -> SpectrumSpec:
 
 
 ReflectanceSpec = Annotated[SpectrumSpec, AfterValidator(_diffuse)]
-
-
-class InFolder(Strict):
-    """Content that names files relative to the folder of the scene file."""
-
-    folder: Path = Field(Path(), exclude=True)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _where_it_lies(cls, data: Any, info: ValidationInfo) -> Any:
-        if isinstance(data, dict) and info.context:
-            if "folder" in data:
-                raise ValueError("unknown key 'folder'")
-            data = {**data, "folder": info.context["folder"]}
-        return data
 
 
 class PictureFile(InFolder):

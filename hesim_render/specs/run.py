@@ -6,7 +6,7 @@ The kind of a YAML file by its keys: of a study (comparison, design, sweep), and
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
@@ -16,7 +16,7 @@ from hesim_render.core.yaml_file import read_yaml
 from hesim_render.specs.design import DesignSpec
 from hesim_render.specs.files import Strict, locate
 from hesim_render.specs.scene import SceneSpec
-from hesim_render.specs.study import NamesFiles, StudySpec
+from hesim_render.specs.study import NamesFiles, StudySpec, TaskFile
 from hesim_render.specs.sweep import SweepSpec
 
 #: What a run's folder holds besides exports.
@@ -57,12 +57,9 @@ class ExportStep(Strict):
         return value
 
 
-class RunSpec(NamesFiles):
+class RunSpec(TaskFile):
     """A whole run."""
 
-    schema_version: Literal[1]
-    name: str = Field(min_length=1)
-    description: str = ""
     scene: str | None = Field(None, description="name or file of a scene")
     video: FileInput | None = None
     cube: FileInput | None = None

@@ -19,7 +19,7 @@ from pydantic import (
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out, reading
 from hesim_render.core.yaml_file import read_yaml
-from hesim_render.specs.files import Strict, apply_overrides, locate, validate
+from hesim_render.specs.files import NamedSpec, Strict, apply_overrides, locate, validate
 from hesim_render.specs.geometry import Direction, Size, Vector
 from hesim_render.specs.light import LampSpec, LightSpec
 from hesim_render.specs.mitsuba_scene import MitsubaSpec
@@ -121,12 +121,9 @@ def _one_or_several(light: Any) -> str:
     return "several" if isinstance(light, list | tuple) else "one"
 
 
-class SceneSpec(Strict):
+class SceneSpec(NamedSpec):
     """A whole scene file."""
 
-    schema_version: Literal[1]
-    name: str = Field(min_length=1)
-    description: str
     target: TargetSpec | None = None
     objects: list[ObjectSpec] = []
     mitsuba: MitsubaSpec | None = None

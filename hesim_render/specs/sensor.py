@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from hesim_render.specs.event_pixels import EvsSpec, SheetEvsSpec
-from hesim_render.specs.files import Strict
+from hesim_render.specs.files import NamedSpec, Strict, text_means
 from hesim_render.specs.frame_pixels import ApsSpec
 from hesim_render.specs.lens import LensSpec
 from hesim_render.specs.sensor_checks import sensor_problems
@@ -39,10 +39,7 @@ class NoiseFile(Strict):
     frame_rate_hz: PositiveFloat | None = Field(None, description="the same of frames; default aps.frame_rate_hz")
     folder: Path = Field(Path(), exclude=True)
 
-    @model_validator(mode="before")
-    @classmethod
-    def _shorthand(cls, data: Any) -> Any:
-        return {"file": data} if isinstance(data, str) else data
+    _shorthand = text_means("file")
 
     @model_serializer(mode="wrap")
     def _as_stated(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -101,12 +98,9 @@ def tile_text(value: Any) -> str:
     return "\n".join(rows)
 
 
-class SensorSpec(Strict):
+class SensorSpec(NamedSpec):
     """A whole sensor file."""
 
-    schema_version: Literal[1]
-    name: str = Field(min_length=1)
-    description: str
     device_seed: int = Field(ge=0, lt=2**64)
     geometry: GeometrySpec
     tile: str

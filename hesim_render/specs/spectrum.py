@@ -1,6 +1,5 @@
 """A spectrum in a file."""
 
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -8,13 +7,12 @@ from pydantic import (
     Field,
     PrivateAttr,
     SerializerFunctionWrapHandler,
-    ValidationInfo,
     model_serializer,
     model_validator,
 )
 
 from hesim_render.core.errors import SpecError
-from hesim_render.specs.files import Strict
+from hesim_render.specs.files import InFolder, Strict
 from hesim_render.spectral import physical
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.spectrum import Spectrum, product
@@ -47,7 +45,14 @@ class ThinFilmSpec(Strict):
     angle_deg: float = Field(0.0, ge=0, lt=90)
 
 
-class SpectrumSpec(Strict):
+#: Keys of a spectrum, exactly one of which it has.
+_SOURCES = (
+    "flat", "csv", "illuminant", "colorchecker", "camera", "wavelength_nm", "blackbody_k", "peak_nm", "dye",
+    "thin_film", "silicon_depth_um", "product",
+)  # fmt: skip
+
+
+class SpectrumSpec(InFolder):
     """One spectrum, from exactly one of the sources below, times `scale`.
 
     A bare number in a file means ``{flat: number}``; a bare string means ``{illuminant: name}``,
@@ -80,44 +85,23 @@ class SpectrumSpec(Strict):
     surface: Literal["coated", "bare"] = Field("coated", description="of the silicon: no reflection, or that in air")
     product: "list[SpectrumSpec] | None" = Field(None, min_length=2, max_length=20, description="of several spectra")
     scale: float = Field(1.0, description="multiplies all values")
-    folder: Path = Field(Path(), exclude=True)
     _table: tuple[tuple[float, ...], tuple[float, ...]] | None = PrivateAttr(None)  # the table of `csv`, read once
 
     @model_validator(mode="before")
     @classmethod
-    def _shorthand(cls, data: Any, info: ValidationInfo) -> Any:
-        if isinstance(data, bool):
-            return data
-        if isinstance(data, int | float):
-            data = {"flat": float(data)}
-        elif isinstance(data, str):
-            data = {"csv": data} if data.endswith(".csv") else {"illuminant": data}
-        if isinstance(data, dict) and info.context:
-            if "folder" in data:
-                raise ValueError("unknown key 'folder'")
-            data = {**data, "folder": info.context["folder"]}
+    def _shorthand(cls, data: Any) -> Any:
+        if isinstance(data, int | float) and not isinstance(data, bool):
+            return {"flat": float(data)}
+        if isinstance(data, str):
+            return {"csv": data} if data.endswith(".csv") else {"illuminant": data}
         return data
 
     @model_validator(mode="after")
     def _one_source(self) -> "SpectrumSpec":
-        sources = {
-            "flat": self.flat,
-            "csv": self.csv,
-            "illuminant": self.illuminant,
-            "colorchecker": self.colorchecker,
-            "camera": self.camera,
-            "wavelength_nm": self.wavelength_nm,
-            "blackbody_k": self.blackbody_k,
-            "peak_nm": self.peak_nm,
-            "dye": self.dye,
-            "thin_film": self.thin_film,
-            "silicon_depth_um": self.silicon_depth_um,
-            "product": self.product,
-        }
-        given = [name for name, value in sources.items() if value is not None]
+        given = [name for name in _SOURCES if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(
-                f"a spectrum needs exactly one of {', '.join(sources)}; found {', '.join(given) or 'none'}"
+                f"a spectrum needs exactly one of {', '.join(_SOURCES)}; found {', '.join(given) or 'none'}"
             )
         needs = {"colorchecker": "patch", "camera": "channel", "wavelength_nm": "value", "peak_nm": "fwhm_nm"}
         partner = needs.get(given[0])

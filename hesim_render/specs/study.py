@@ -5,8 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from hesim_render.specs.files import Strict
-from hesim_render.specs.reflectance import InFolder
+from hesim_render.specs.files import InFolder, Strict, text_means
 from hesim_render.specs.spectrum import SpectrumSpec
 
 #: Groups of figures.
@@ -27,6 +26,14 @@ class NamesFiles(InFolder):
         return str(self.folder / name) if is_path or not shipped else name
 
 
+class TaskFile(NamesFiles):
+    """What the files of runs, studies, designs and sweeps begin with."""
+
+    schema_version: Literal[1]
+    name: str = Field(min_length=1)
+    description: str = ""
+
+
 class SurfacesSpec(NamesFiles):
     """What is looked at: a set of reflectances, a hyperspectral cube, or a scene that is rendered into one."""
 
@@ -44,10 +51,7 @@ class SurfacesSpec(NamesFiles):
     scale: float = Field(1.0, gt=0, le=1e9, description="multiplies the values of the cube")
     name: str | None = Field(None, description="default: the name of the set or of the file")
 
-    @model_validator(mode="before")
-    @classmethod
-    def _shorthand(cls, data: Any) -> Any:
-        return {"reflectances": data} if isinstance(data, str) else data
+    _shorthand = text_means("reflectances")
 
     @model_validator(mode="after")
     def _one(self) -> "SurfacesSpec":
@@ -75,10 +79,7 @@ class NamedLight(Strict):
     name: str = Field(min_length=1)
     spectrum: SpectrumSpec
 
-    @model_validator(mode="before")
-    @classmethod
-    def _shorthand(cls, data: Any) -> Any:
-        return {"name": data, "spectrum": data} if isinstance(data, str) else data
+    _shorthand = text_means("name", "spectrum")
 
     @model_validator(mode="after")
     def _check(self) -> "NamedLight":
@@ -94,10 +95,7 @@ class SetUseSpec(NamesFiles):
     palette: str | None = Field(None, description="name of a shipped palette, or a file; default that of the study")
     name: str | None = Field(None, description="default: the name of the set, and of a palette of its own")
 
-    @model_validator(mode="before")
-    @classmethod
-    def _shorthand(cls, data: Any) -> Any:
-        return {"set": data} if isinstance(data, str) else data
+    _shorthand = text_means("set")
 
 
 class NoiseStudySpec(Strict):
@@ -108,12 +106,9 @@ class NoiseStudySpec(Strict):
     seed: int = Field(1, ge=0, lt=2**63)
 
 
-class StudySpec(NamesFiles):
+class StudySpec(TaskFile):
     """A study of filter sets."""
 
-    schema_version: Literal[1]
-    name: str = Field(min_length=1)
-    description: str = ""
     sensors: list[str] = Field(min_length=1, description="names or files; their pixels, lens and noise")
     sensor_keys: dict[str, Any] = Field({}, description="keys of the sensor files to change, as aps.read_noise_e: 1.5")
     palette: str = "dyes"

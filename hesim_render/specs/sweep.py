@@ -6,7 +6,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from hesim_render.core.errors import did_you_mean
 from hesim_render.specs.files import Strict
-from hesim_render.specs.study import NamesFiles
+from hesim_render.specs.study import TaskFile
 
 #: Most runs of a sweep.
 MOST_RUNS = 100_000
@@ -40,12 +40,9 @@ class RangeSpec(Strict):
         return [float(f"{value:.12g}") for value in space(self.first, self.last, self.count)]
 
 
-class SweepSpec(NamesFiles):
+class SweepSpec(TaskFile):
     """A sweep over keys of scenes, sensors and ISP steps, or over keys of a study of filter sets."""
 
-    schema_version: Literal[1]
-    name: str = Field(min_length=1)
-    description: str = ""
     study: str | None = Field(None, description="name or file of a study, in place of scenes and sensors")
     scenes: list[str] = []
     sensors: list[str] = []
