@@ -22,7 +22,7 @@ from hesim_render.core.guard import printable
 from hesim_render.core.npz import read_array
 from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.schedule import BLOCK_INTERVALS, Block
-from hesim_render.pixels.evs.events import EVENT_DTYPE
+from hesim_render.pixels.evs.events import events_of
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import with_crosstalk
 from hesim_render.sources.render.light_level import in_absolute_light
@@ -138,9 +138,7 @@ def read_events(path: Path, shape: tuple[int, int], duration_us: float) -> NDArr
         wrong = np.flatnonzero(~((values >= low) & (values <= high)))
         if wrong.size:
             raise PeerError(f"wrote {name} {values[wrong[0]]:g} in event {wrong[0]}; expected {low:g} to {high:g}")
-    events = np.empty(len(table), EVENT_DTYPE)
-    events["t_us"], events["x"], events["y"] = np.rint(table[:, 0]), table[:, 1], table[:, 2]
-    events["polarity"] = np.where(table[:, 3] > 0, 1, -1)
+    events = events_of(np.rint(table[:, 0]), *table[:, 1:].T)
     return events[np.argsort(events["t_us"], kind="stable")]
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import printable, reading, require_memory
 from hesim_render.exchange.stream import EventStream
-from hesim_render.pixels.evs.events import EVENT_DTYPE
+from hesim_render.pixels.evs.events import events_of
 
 
 class FlatTable:
@@ -245,11 +245,8 @@ def read(path: Path, number: int, compression: int, begin: int, end: int) -> Ite
             if len(content) < 4:
                 raise SpecError("a packet of events is empty", file=path)
             made = FlatTable.root(content[4:], b"EVTS").structures(0, _EVENT)
-            events = np.empty(made.size, dtype=EVENT_DTYPE)
             # a negative coordinate becomes one above 32767, which no grid has
-            events["t_us"], events["x"], events["y"] = made["t_us"], made["x"], made["y"]
-            events["polarity"] = np.where(made["on"] > 0, 1, -1)
-            yield events
+            yield events_of(made["t_us"], made["x"], made["y"], made["on"])
 
 
 def _unpacked(content: bytes, compression: int, path: Path) -> bytes:

@@ -14,7 +14,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import printable, reading
 from hesim_render.exchange import raw_file
 from hesim_render.exchange.stream import EventStream
-from hesim_render.pixels.evs.events import EVENT_DTYPE
+from hesim_render.pixels.evs.events import events_of
 
 _ENTRY = np.dtype([("t", "<u4"), ("word", "<u4")])
 _PLACE_BITS = 14
@@ -102,9 +102,5 @@ def read(path: Path, begin: int) -> Iterator[NDArray]:
     """
     for piece in raw_file.words(path, begin, _ENTRY):
         word = piece["word"]
-        events = np.empty(piece.size, dtype=EVENT_DTYPE)
-        events["t_us"] = piece["t"]
-        events["x"] = word & np.uint32(LARGEST_SIDE - 1)
-        events["y"] = word >> np.uint32(_PLACE_BITS) & np.uint32(LARGEST_SIDE - 1)
-        events["polarity"] = np.where(word >> np.uint32(2 * _PLACE_BITS) & np.uint32(1), 1, -1)
-        yield events
+        x, y = (word >> np.uint32(bits) & np.uint32(LARGEST_SIDE - 1) for bits in (0, _PLACE_BITS))
+        yield events_of(piece["t"], x, y, word >> np.uint32(2 * _PLACE_BITS) & np.uint32(1))

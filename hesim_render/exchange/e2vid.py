@@ -16,7 +16,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading
 from hesim_render.core.npz import NpzWriter, member_header, require_names, stream_list, stream_member
 from hesim_render.exchange.stream import BLOCK, EventStream
-from hesim_render.pixels.evs.events import EVENT_DTYPE
+from hesim_render.pixels.evs.events import events_of
 
 _COLUMNS = {"t": "<i8", "x": "<u2", "y": "<u2", "p": "u1"}
 #: Lines that are formatted together; a line is 44 bytes while it is made.
@@ -117,7 +117,4 @@ def read_arrays(path: Path, names: dict[str, str]) -> Iterator[NDArray]:
             if low < least or high > most:
                 value = low if low < least else high
                 raise SpecError(f"{names[key]} holds {value}; expected {least} to {most}", file=path)
-        events = np.empty(columns["t"].size, dtype=EVENT_DTYPE)
-        events["t_us"], events["x"], events["y"] = columns["t"], columns["x"], columns["y"]
-        events["polarity"] = np.where(columns["p"] > 0, 1, -1)
-        yield events
+        yield events_of(*(columns[key] for key in _COLUMNS))

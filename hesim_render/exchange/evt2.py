@@ -16,7 +16,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.exchange import raw_file
 from hesim_render.exchange.stream import EventStream
 from hesim_render.exchange.triggers import TRIGGER_DTYPE, joined
-from hesim_render.pixels.evs.events import EVENT_DTYPE
+from hesim_render.pixels.evs.events import events_of
 
 _LOW_BITS = 6
 _HIGH_BITS = 28
@@ -106,11 +106,9 @@ def _decoded(path: Path, begin: int) -> Iterator[tuple[NDArray, NDArray]]:
         number = np.cumsum(is_high) - 1
         is_event = kind <= _ON
         word = piece[is_event]
-        events = np.empty(word.size, dtype=EVENT_DTYPE)
-        events["t_us"] = (times[number[is_event]] << _LOW_BITS) | (word >> np.uint32(22) & np.uint32(63))
-        events["x"] = word >> np.uint32(11) & np.uint32(0x7FF)
-        events["y"] = word & np.uint32(0x7FF)
-        events["polarity"] = np.where(kind[is_event] == _ON, 1, -1)
+        t_us = (times[number[is_event]] << _LOW_BITS) | (word >> np.uint32(22) & np.uint32(63))
+        x, y = word >> np.uint32(11) & np.uint32(0x7FF), word & np.uint32(0x7FF)
+        events = events_of(t_us, x, y, kind[is_event] == _ON)
         at = np.flatnonzero(kind == _TRIGGER)
         triggers = np.empty(at.size, dtype=TRIGGER_DTYPE)
         triggers["t_us"] = (times[number[at]] << _LOW_BITS) | (piece[at] >> np.uint32(22) & np.uint32(63))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.exchange.mcap_records import records, require_mcap
 from hesim_render.exchange.stream import EventStream
-from hesim_render.pixels.evs.events import EVENT_DTYPE
+from hesim_render.pixels.evs.events import events_of
 
 BEGIN = b"\x89MCAP0\r\n"
 EVENT_TOPIC, FRAME_TOPIC, FRAME_ID = "/camera/events", "/camera/image_raw", "camera"
@@ -178,12 +178,9 @@ def read(path: Path, topic: str) -> Iterator[NDArray]:
             raise SpecError("a packet of events ends early; the file is damaged", file=path)
         padded = data[begin + 4 :] + bytes(_BEHIND_LAST)
         made = np.frombuffer(padded, dtype=_BLOCK, count=count)
-        events = np.empty(count, dtype=EVENT_DTYPE)
-        events["t_us"] = made["sec"].astype(np.int64) * 1_000_000 + made["nanosec"] // 1000
-        events["x"][0], events["y"][0] = struct.unpack_from("<HH", data, begin)
-        events["x"][1:], events["y"][1:] = made["x"][:-1], made["y"][:-1]
-        events["polarity"] = np.where(made["p"] > 0, 1, -1)
-        yield events
+        first = struct.unpack_from("<HH", data, begin)
+        x, y = (np.append(np.uint16(own), made[name][:-1]) for own, name in zip(first, "xy", strict=True))
+        yield events_of(made["sec"].astype(np.int64) * 1_000_000 + made["nanosec"] // 1000, x, y, made["p"])
 
 
 def holds(path: Path) -> tuple[bool, bool]:

@@ -19,7 +19,7 @@ from hesim_render.core.hdf5 import LARGEST_CHUNK_BYTES, dataset_of, is_whole, ne
 from hesim_render.exchange import ecf
 from hesim_render.exchange.stream import EventStream
 from hesim_render.exchange.triggers import MOST_TRIGGERS, TRIGGER_DTYPE, no_triggers
-from hesim_render.pixels.evs.events import EVENT_DTYPE
+from hesim_render.pixels.evs.events import events_of, no_events
 
 EVENTS, TRIGGERS = "CD/events", "EXT_TRIGGER/events"
 _CHUNK, _PERIOD_US = 1 << 14, 2000
@@ -47,7 +47,7 @@ def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
             made.attrs.create(key, value, dtype=text)
         stored = _packed_records(made)
         count, index = 0, _Index()
-        waiting = np.empty(0, EVENT_DTYPE)
+        waiting = no_events()
         for events in stream:
             index.add(events["t_us"])
             waiting = np.concatenate([waiting, events])
@@ -180,10 +180,7 @@ def read(path: Path) -> Iterator[NDArray]:
             rows = stored[first : first + size]
             if rows["p"].min() < -1 or rows["p"].max() > 1 or min(rows["x"].min(), rows["y"].min()) < 0:
                 raise SpecError(f"{EVENTS} has events that are none, from number {first}", file=path)
-            events = np.empty(size, EVENT_DTYPE)
-            events["t_us"], events["x"], events["y"] = rows["t"], rows["x"], rows["y"]
-            events["polarity"] = np.where(rows["p"] > 0, 1, -1)
-            yield events
+            yield events_of(rows["t"], rows["x"], rows["y"], rows["p"])
 
 
 def _unpacked(stored: Any, first: int, size: int, path: Path) -> NDArray:

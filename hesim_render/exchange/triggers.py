@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import SpecError
-from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
+from hesim_render.pixels.evs.events import events_of, no_events
 
 #: t_us: time of the edge, µs; edge: +1 rising, −1 falling; channel: number of the line.
 TRIGGER_DTYPE = np.dtype([("t_us", "i8"), ("edge", "i1"), ("channel", "u1")])
@@ -126,7 +126,5 @@ def _inserted(events: NDArray, triggers: NDArray, row: int) -> tuple[NDArray, ND
         return events, None
     place = np.searchsorted(events["t_us"], triggers["t_us"], side="left")
     rows = np.concatenate([np.array([row], np.uint16), events["y"]])
-    edges = np.empty(triggers.size, dtype=EVENT_DTYPE)
-    edges["t_us"], edges["x"], edges["y"] = triggers["t_us"], triggers["channel"], rows[place]
-    edges["polarity"] = triggers["edge"]
+    edges = events_of(triggers["t_us"], triggers["channel"], rows[place], triggers["edge"])
     return np.insert(events, place, edges), np.insert(np.zeros(events.size, np.bool_), place, True)

@@ -31,6 +31,14 @@ def no_events() -> NDArray:
     return np.empty(0, dtype=EVENT_DTYPE)
 
 
+def events_of(t_us: ArrayLike, x: ArrayLike, y: ArrayLike, is_on: ArrayLike) -> NDArray[np.void]:
+    """Structured array of events [event] of `EVENT_DTYPE`; ON where `is_on` is above 0, else OFF."""
+    events = np.empty(np.size(x), EVENT_DTYPE)
+    events["t_us"], events["x"], events["y"] = t_us, x, y
+    events["polarity"] = np.where(np.asarray(is_on) > 0, 1, -1)
+    return events
+
+
 def events_at(t_us: ArrayLike, pixel: NDArray[np.integer], polarity: ArrayLike, cols: int) -> NDArray[np.void]:
     """Structured array of events at flat pixel indices of an event grid `cols` wide."""
     events = np.empty(len(pixel), EVENT_DTYPE)
