@@ -79,6 +79,11 @@ class EventFigures:
     intervals: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     findings: list[str] = field(default_factory=list)
 
+    def add(self, key: str, name: str, value: dict[str, Any], pixels: int | None = None, **of: float | None) -> None:
+        """Add an entry; of all pixels, at the temperature of the bench and at no light or contrast, unless given."""
+        known = {"lux": None, "contrast": None, "temperature_c": self.bench.spec.temperature_c} | of
+        self.entries.append(Entry(key, name, value, pixels=self.bench.pixels if pixels is None else pixels, **known))
+
 
 def event_figures(bench: EventBench, progress: Callable[[str, float], None] | None = None) -> EventFigures:
     """Evaluate all recordings of a bench.
@@ -131,22 +136,17 @@ def _add_count_thresholds(
     if lux is None and not not_reset:
         return None
     for name, entry in zip(POLARITIES, entries, strict=True):
-        figures.entries.append(
-            Entry("threshold_by_counts", name, entry, lux, None, figures.bench.spec.temperature_c, _number(good))
-        )
+        figures.add("threshold_by_counts", name, entry, _number(good), lux=lux)
     on, off = (entry["value"] for entry in entries)
     return (on, off) if not_reset and on is not None and off is not None else None
 
 
 def _add_bandwidth(figures: EventFigures, good: NDArray[np.bool_], dead_us: float | None) -> None:
     band = figures.band = bandwidth(figures.bench, good)
-    celsius = figures.bench.spec.temperature_c
     if band is None:
-        nothing = not_identifiable("no recordings of modulated light")
-        figures.entries.append(Entry("bandwidth", "", nothing, None, None, celsius, _number(good)))
+        figures.add("bandwidth", "", not_identifiable("no recordings of modulated light"), _number(good))
         return
-    name = "" if band.in_bursts else POLARITIES[0]
-    figures.entries.append(Entry("bandwidth", name, band.entry, band.lux, None, celsius, _number(good)))
+    figures.add("bandwidth", "" if band.in_bursts else POLARITIES[0], band.entry, _number(good), lux=band.lux)
     if not band.in_bursts and dead_us is not None and band.hz.max() * dead_us * S_PER_US > _SHORT_DEAD_TIME:
         figures.findings.append(
             f"bandwidth: the dead time of {dead_us:.4g} µs is not short against a cycle of {band.hz.max():.4g} Hz, so "
@@ -189,11 +189,10 @@ def _temperature(bench: EventBench, every: list[Responses]) -> float | None:
 
 
 def _add_curves(figures: EventFigures, pair: tuple[SCurve, SCurve], light: list[Responses]) -> None:
+    celsius = _temperature(figures.bench, light)
     for curve, name in zip(pair, POLARITIES, strict=True):
         for key, value in curve.entries.items():
-            figures.entries.append(
-                Entry(key, name, value, curve.lux, None, _temperature(figures.bench, light), curve.pixels)
-            )
+            figures.add(key, name, value, curve.pixels, lux=curve.lux, temperature_c=celsius)
 
 
 def _of_size(bench: EventBench, size: float) -> list[Responses]:
@@ -211,18 +210,17 @@ def _add_latencies(figures: EventFigures, good: NDArray[np.bool_]) -> None:
     bench = figures.bench
     sizes = sorted({one.size for one in bench.responses})
     if not sizes:
-        nothing = not_identifiable("no recordings of steps")
-        figures.entries += [Entry(key, "ON", nothing, None, None, None, 0) for key in ("latency", "jitter")]
+        for key in ("latency", "jitter"):
+            figures.add(key, "ON", not_identifiable("no recordings of steps"), 0, temperature_c=None)
         return
     best = max(sizes, key=lambda size: (len(_of_size(bench, size)), size))
     for polarity, name in enumerate(POLARITIES):
         for one in _of_size(bench, best):
             answer = answers(one, polarity, good, bench.temperature_c(one.steps))
             figures.latencies[polarity].append(answer)
+            about = {"lux": answer.lux, "contrast": answer.contrast, "temperature_c": answer.temperature_c}
             for key, value in (("latency", answer.latency), ("jitter", answer.jitter)):
-                figures.entries.append(
-                    Entry(key, name, value, answer.lux, answer.contrast, answer.temperature_c, answer.pixels)
-                )
+                figures.add(key, name, value, answer.pixels, **about)
 
 
 def _add_ranges(figures: EventFigures, good: NDArray[np.bool_], thresholds: tuple[float, float] | None) -> None:
@@ -236,8 +234,8 @@ def _add_ranges(figures: EventFigures, good: NDArray[np.bool_], thresholds: tupl
         if thresholds is not None:
             theta = thresholds[polarity]
         if not np.isfinite(theta):
-            nothing = not_identifiable("the threshold is not known")
-            figures.entries += [Entry(key, name, nothing, None, None, None, pixels) for key in keys]
+            for key in keys:
+                figures.add(key, name, not_identifiable("the threshold is not known"), pixels, temperature_c=None)
             ranges.append(None)
             continue
         every, false = [], []
@@ -256,11 +254,8 @@ def _add_ranges(figures: EventFigures, good: NDArray[np.bool_], thresholds: tupl
         one_range = dynamic_range(every, false)
         ranges.append(one_range)
         values = one_range.least_lux, one_range.most_lux, one_range.range_db
-        contrast = float(np.expm1(2 * theta))
-        figures.entries += [
-            Entry(key, name, value, None, contrast, bench.spec.temperature_c, pixels)
-            for key, value in zip(keys, values, strict=True)
-        ]
+        for key, value in zip(keys, values, strict=True):
+            figures.add(key, name, value, pixels, contrast=float(np.expm1(2 * theta)))
     figures.ranges = ranges[0], ranges[1]
 
 
@@ -274,12 +269,12 @@ def _add_background(figures: EventFigures) -> None:
     figures.backgrounds = background(figures.bench)
     for one in figures.backgrounds:
         for name, value in zip(POLARITIES, one.rates, strict=True):
-            figures.entries.append(Entry("background", name, value, one.lux, None, one.temperature_c, one.pixels))
+            figures.add("background", name, value, one.pixels, lux=one.lux, temperature_c=one.temperature_c)
         if one.finding:
             figures.findings.append(one.finding)
     for polarity, name in enumerate(POLARITIES):
         value = doubling(figures.backgrounds, polarity, figures.bench.spec.simulated)
-        figures.entries.append(Entry("doubling", name, value, None, None, None, figures.bench.pixels))
+        figures.add("doubling", name, value, temperature_c=None)
 
 
 def _add_times(figures: EventFigures) -> float | None:
@@ -287,10 +282,9 @@ def _add_times(figures: EventFigures) -> float | None:
     bench = figures.bench
     tallies = [bench.tally(name) for name in bench.names]
     figures.intervals = np.sum([one.intervals for one in tallies], axis=0)
-    limit, _ = readout_limit(tallies)
     dead = dead_time(tallies)
-    for key, value in (("dead_time", dead), ("readout_limit", limit)):
-        figures.entries.append(Entry(key, "", value, None, None, bench.spec.temperature_c, bench.pixels))
+    figures.add("dead_time", "", dead)
+    figures.add("readout_limit", "", readout_limit(tallies)[0])
     dead_us: float | None = dead["value"]
     return dead_us
 
@@ -299,18 +293,11 @@ def _add_defects(
     figures: EventFigures, hot: NDArray[np.bool_], dead: tuple[NDArray[np.bool_], NDArray[np.bool_]]
 ) -> None:
     bench = figures.bench
-    if len(bench.spec.steady) > 1:
-        value = still.share(int(np.count_nonzero(hot)), bench.pixels)
-    else:
-        value = not_identifiable("it takes two steady recordings")
-    figures.entries.append(Entry("hot", "", value, None, None, bench.spec.temperature_c, bench.pixels))
+    lacking = "" if len(bench.spec.steady) > 1 else "it takes two steady recordings"
+    figures.add("hot", "", not_identifiable(lacking) if lacking else still.share(_number(hot), bench.pixels))
+    lacking = "" if bench.responses else "no recordings of steps"
     for name, mask in zip(POLARITIES, dead, strict=True):
-        value = (
-            still.share(int(np.count_nonzero(mask)), bench.pixels)
-            if bench.responses
-            else not_identifiable("no recordings of steps")
-        )
-        figures.entries.append(Entry("dead", name, value, None, None, bench.spec.temperature_c, bench.pixels))
+        figures.add("dead", name, not_identifiable(lacking) if lacking else still.share(_number(mask), bench.pixels))
 
 
 def _has_ticks(bench: EventBench) -> bool:

@@ -83,39 +83,34 @@ def make_report(
     simulated = len(folders) == 1 and not folders[0].is_dir()
     if not simulated:
         bench_folder, frame_folder = _sorted(folders)
-    folder = OutputFolder(out, RESULT_NAME, overwrite)
-    try:
-        with output_errors(folder.target):
-            if simulated:
-                from hesim_render.report.simulate import simulate_captures
+    with OutputFolder(out, RESULT_NAME, overwrite) as folder, output_errors(folder.target):
+        if simulated:
+            from hesim_render.report.simulate import simulate_captures
 
-                bench_folder, frame_folder, name = simulate_captures(
-                    captures[0], folder.path / EVENT_CAPTURES, folder.path / FRAME_CAPTURES, size, seed,
-                    lambda what, part: stated(what, 0.7 * part),
-                )  # fmt: skip
-            begin = 0.7 if simulated else 0.0
-            bench = None if bench_folder is None else EventBench(bench_folder)
-            if not simulated:
-                name = bench.spec.sensor if bench is not None else folders[0].resolve().name
-                if bench is not None and bench.spec.frames is not None and frame_folder is None:
-                    frame_folder = bench.path(bench.spec.frames)
-            events = None
-            if bench is not None and bench.names:
-                events = event_figures(bench, lambda what, part: stated(what, begin + (0.9 - begin) * part))
-            stated("frames", 0.9)
-            frames = None
-            if frame_folder is not None:
-                try:
-                    frames = frame_figures(frame_folder)
-                except SpecError as error:
-                    if not simulated or events is None:
-                        raise
-                    events.findings.append(f"frames: {str(error).replace(f'{frame_folder}', FRAME_CAPTURES)}")
-            pages = _write(folder.path, name, events, frames)
-        return Report(folder.commit(), events, frames, pages)
-    except BaseException:
-        folder.discard()
-        raise
+            bench_folder, frame_folder, name = simulate_captures(
+                captures[0], folder.path / EVENT_CAPTURES, folder.path / FRAME_CAPTURES, size, seed,
+                lambda what, part: stated(what, 0.7 * part),
+            )  # fmt: skip
+        begin = 0.7 if simulated else 0.0
+        bench = None if bench_folder is None else EventBench(bench_folder)
+        if not simulated:
+            name = bench.spec.sensor if bench is not None else folders[0].resolve().name
+            if bench is not None and bench.spec.frames is not None and frame_folder is None:
+                frame_folder = bench.path(bench.spec.frames)
+        events = None
+        if bench is not None and bench.names:
+            events = event_figures(bench, lambda what, part: stated(what, begin + (0.9 - begin) * part))
+        stated("frames", 0.9)
+        frames = None
+        if frame_folder is not None:
+            try:
+                frames = frame_figures(frame_folder)
+            except SpecError as error:
+                if not simulated or events is None:
+                    raise
+                events.findings.append(f"frames: {str(error).replace(f'{frame_folder}', FRAME_CAPTURES)}")
+        pages = _write(folder.path, name, events, frames)
+    return Report(folder.target, events, frames, pages)
 
 
 def _sorted(folders: Sequence[Path]) -> tuple[Path | None, Path | None]:

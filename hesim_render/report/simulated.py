@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
 from hesim_render.core.units import S_PER_US, US_PER_S
+from hesim_render.core.yaml_file import yaml_text
 from hesim_render.exchange import EventStream, evt3
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.pixels.evs.stage import EvsStage
@@ -291,10 +291,8 @@ class Instrument:
         return file.name
 
     def _write(self) -> None:
-        yaml = YAML()
-        yaml.default_flow_style, yaml.width = None, 120
-        with (self._folder / BENCH_NAME).open("w", encoding="utf-8") as file:
-            yaml.dump({key: value for key, value in self._content.items() if value or key == "schema_version"}, file)
+        content = {key: value for key, value in self._content.items() if value or key == "schema_version"}
+        (self._folder / BENCH_NAME).write_text(yaml_text(content, width=120), encoding="utf-8")
 
     def _written(self) -> EventBench:
         """What has been recorded so far, as the estimators see it."""

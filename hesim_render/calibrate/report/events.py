@@ -6,7 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.calibrate.report import parts
-from hesim_render.calibrate.report.parts import HEAD, findings, headline, p_text, parameter_row
+from hesim_render.calibrate.report.parts import (
+    HEAD,
+    findings,
+    goodness_row,
+    headline,
+    law_row,
+    p_text,
+    parameter_row,
+    with_interval,
+)
 from hesim_render.core.drawing import COLOURS, legend_below, panel, picture, points, svg
 from hesim_render.core.html import filled, tick_text
 
@@ -154,44 +163,21 @@ def _evs_rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
     rows += [parameter_row(text, section[key]) for key, text in names.items() if key in section]
     rows.append(parameter_row("dispersion in time, ON + OFF", section["dispersion"]["temporal"]))
     rows.append(parameter_row("dispersion in time, ON − OFF", section["dispersion"]["temporal_difference"]))
-    logs = section["shot_law_log_likelihood"]
-    other = next(k for k in logs if k not in ("decisive", section["shot_law"]))
-    verdict = "" if logs["decisive"] else ", not decisive"
-    rows.append(
-        (
-            "shot law",
-            section["shot_law"],
-            "",
-            f"ln L above {other}: {logs[section['shot_law']] - logs[other]:.1f}{verdict}",
-        )
-    )
-    rows.append(
-        (
-            "χ²/dof",
-            f"{section['goodness']['chi2_per_dof']:.3f}",
-            "",
-            f"{section['goodness']['dof']} degrees of freedom, p = {section['goodness']['p_value']:.2g}",
-        )
-    )
+    logs, law = section["shot_law_log_likelihood"], section["shot_law"]
+    other = next(k for k in logs if k not in ("decisive", law))
+    rows += [law_row(law, other, logs[law] - logs[other], logs["decisive"]), goodness_row(section["goodness"])]
     kinds = ", ".join(f"{count} {kind}" for kind, count in (section.get("defects") or {}).items())
     rows.append(("bad pixels", str(section["bad_pixels"]), "", kinds))
     return rows
 
 
 def _position_rows(section: dict[str, Any]) -> list[tuple[str, ...]]:
-    def text(item: dict[str, Any]) -> str:
-        return (
-            "not identifiable"
-            if item["value"] is None
-            else f"{item['value']:.4g} ± {1.96 * item['standard_error']:.2g}"
-        )
-
-    rows = []
+    rows, goodness = [], section["goodness"]
     for k, item in enumerate(section["positions"]):
         beta = ["–" if b is None else f"{b:.4g}" for b in section["beta"][k]]
-        goodness = section["goodness"]
         fit = f"{goodness['positions_chi2_per_dof'][k]:.3f}", p_text(goodness["positions_p_value"][k])
-        rows.append((str(tuple(item["tile_position"])), *(text(item[n]) for n in "ABCD"), *beta, *fit))
+        own = [with_interval(item[n]["value"], item[n].get("standard_error")) for n in "ABCD"]
+        rows.append((str(tuple(item["tile_position"])), *own, *beta, *fit))
     return rows
 
 
@@ -279,19 +265,9 @@ def _rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
     rows += [parameter_row(f"noise σ at {item['signal_dn']:.4g} DN", item) for item in section["noise"]]
     for k, (value, error) in enumerate(zip(section["beta"][0], section["beta_standard_error"][0], strict=True)):
         rows.append((f"β{k}", f"{value:.5g}", "" if not error else f"± {1.96 * error:.2g}", ""))
-    decisive = "" if section["shot_law_decisive"] else ", not decisive"
-    rows.append(
-        ("shot law", section["shot_law"], "", f"ln L above the other: {section['shot_law_advantage']:.1f}{decisive}")
-    )
+    rows.append(law_row(section["shot_law"], "the other", section["shot_law_advantage"], section["shot_law_decisive"]))
     goodness = section["goodness"]
-    rows.append(
-        (
-            "χ²/dof",
-            f"{goodness['chi2_per_dof']:.3f}",
-            "",
-            f"{goodness['dof']} degrees of freedom, p = {p_text(goodness['p_value'])}",
-        )
-    )
+    rows.append(goodness_row(goodness))
     for name, text in (("steps", "right after steps"), ("times", "later after steps"), ("steady", "in steady light")):
         rows.append((f"p of events {text}", p_text(goodness[f"{name}_p_value"]), "", ""))
     kinds = ", ".join(f"{name} {count}" for name, count in section["defects"].items() if count)

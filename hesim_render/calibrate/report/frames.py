@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.parts import HEAD, findings, headline, p_text, parameter_row
+from hesim_render.calibrate.report.parts import HEAD, findings, headline, p_text, parameter_row, with_interval
 from hesim_render.core.drawing import COLOURS, legend_below, new_figure, panel, picture, points, svg
 from hesim_render.core.html import filled, number
 from hesim_render.pixels.aps.formulas import polynomial
@@ -134,9 +134,5 @@ def _beta_rows(section: dict[str, Any]) -> list[tuple[str, ...]]:
                 goodness = section["goodness"]
                 chances = goodness.get("p_value")
                 fit = f"{goodness['chi2_per_dof'][i][j]:.3f}", p_text(chances[i][j] if chances else None)
-                texts = [
-                    "not identifiable" if b is None else f"{b:.4g} ± {1.96 * e:.2g}"
-                    for b, e in zip(cell, errors, strict=True)
-                ]
-                rows.append((f"({i}, {j})", *texts, *fit))
+                rows.append((f"({i}, {j})", *map(with_interval, cell, errors), *fit))
     return rows

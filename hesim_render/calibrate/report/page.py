@@ -13,7 +13,7 @@ from hesim_render.calibration.file import as_written
 from hesim_render.calibration.spec import SECTIONS
 from hesim_render.core.drawing import report_style
 from hesim_render.core.html import filled
-from hesim_render.core.output import alone_in, replacing
+from hesim_render.core.output import alone_in, write_whole
 
 
 def write_report(calibration: str | Path, report: str | Path, overwrite: bool = False) -> Path:
@@ -49,8 +49,7 @@ def write_report(calibration: str | Path, report: str | Path, overwrite: bool = 
                 (key, plain_text(value)) for key, value in capture.items() if value not in (None, "") and key != "truth"
             ],
         )  # fmt: skip
-    with replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_whole(path, page)
     return Path(report)
 
 

@@ -109,6 +109,22 @@ def p_text(p_value: float | None) -> str:
     return f"{p_value:.2g}" if p_value >= 1e-300 else "< 1e-300"
 
 
+def with_interval(value: float | None, standard_error: float | None) -> str:
+    """A value with half of its 95 % interval."""
+    return "not identifiable" if value is None else f"{value:.4g} ± {1.96 * (standard_error or 0.0):.2g}"
+
+
+def goodness_row(goodness: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    """How well the law fits, as `parameter_row`."""
+    why = f"{goodness['dof']} degrees of freedom, p = {p_text(goodness['p_value'])}"
+    return "χ²/dof", f"{goodness['chi2_per_dof']:.3f}", "", why
+
+
+def law_row(law: str, other: str, advantage: float, is_decisive: bool) -> tuple[str, str, str, str]:
+    """Which shot law holds, and by how much more likely than the `other` the counts are with it, as `parameter_row`."""
+    return "shot law", law, "", f"ln L above {other}: {advantage:.1f}{'' if is_decisive else ', not decisive'}"
+
+
 def parameter_row(name: str, item: Any) -> tuple[str, str, str, str]:
     """Name, value, interval and unit (or why there is no value) of one parameter, as texts for a table.
 
