@@ -18,7 +18,7 @@ from hesim_render.benchmark.spans import SPAN_S, Span, discard_spans, spans_of
 from hesim_render.benchmark.worker import attempt, order_of
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
 from hesim_render.core.guard import WholeFile
-from hesim_render.core.output import check_target, output_errors, replacing
+from hesim_render.core.output import check_target, output_errors, write_whole
 from hesim_render.core.progress import Progress, counted, in_words
 from hesim_render.specs.benchmark import BenchmarkSpec, read_benchmark
 from hesim_render.specs.files import content_hash
@@ -201,8 +201,7 @@ def opened(plan: BenchmarkPlan, out: Path) -> Path:
         text = json.dumps(_plan_content(plan), indent=1, sort_keys=True, ensure_ascii=False) + "\n"
         with output_errors(root):
             (root / "clips").mkdir(parents=True, exist_ok=True)
-        with replacing(file) as unfinished:
-            unfinished.write_text(text, encoding="utf-8")
+        write_whole(file, text)
     return root
 
 
@@ -246,8 +245,7 @@ def _report(
         "workers": workers, "cluster": scheduler is not None,
         "expected": None if expected is None else expected.as_dict(),
     })  # fmt: skip
-    with replacing(file) as unfinished:
-        unfinished.write_text(json.dumps(runs, indent=1) + "\n", encoding="utf-8")
+    write_whole(file, json.dumps(runs, indent=1) + "\n")
 
 
 def _finish(plan: BenchmarkPlan, root: Path) -> None:
@@ -285,7 +283,5 @@ def _finish(plan: BenchmarkPlan, root: Path) -> None:
     }  # fmt: skip
     text = json.dumps(manifest, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
     write_card(root / CARD_FILE, manifest, contents)
-    with replacing(root / CROISSANT_FILE) as unfinished:
-        unfinished.write_text(croissant(manifest, text), encoding="utf-8")
-    with replacing(root / MANIFEST_FILE) as unfinished:  # last: its presence says that all is there
-        unfinished.write_text(text, encoding="utf-8")
+    write_whole(root / CROISSANT_FILE, croissant(manifest, text))
+    write_whole(root / MANIFEST_FILE, text)  # last: its presence says that all is there

@@ -18,17 +18,13 @@ import numpy as np
 
 from hesim_render.benchmark.statistics import FIGURES
 from hesim_render.core.guard import printable
+from hesim_render.core.output import replacing, write_whole
 from hesim_render.core.progress import counted
 from hesim_render.specs.benchmark import SPLITS
 
 HISTOGRAM_FILE = "histograms.png"
 _BINS = 24
 _MARKS = re.compile(r"[\\`*\[\]!|#~]")
-
-
-def _decades(values: np.ndarray) -> float:
-    positive = values[values > 0]
-    return float(np.log10(positive.max() / positive.min())) if positive.size else 0.0
 
 
 def spread(clips: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
@@ -42,10 +38,12 @@ def spread(clips: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     for name in FIGURES:
         given = [clip["figures"].get(name) for clip in clips]
         values = np.array([value for value in given if value is not None], dtype=np.float64)
+        positive = values[values > 0]
         if values.size:
             result[name] = {
                 "min": float(values.min()), "median": float(np.median(values)), "max": float(values.max()),
-                "decades": _decades(values), "zero": int(np.count_nonzero(values <= 0)),
+                "decades": float(np.log10(positive.max() / positive.min())) if positive.size else 0.0,
+                "zero": int(np.count_nonzero(values <= 0)),
             }  # fmt: skip
     return result
 
@@ -162,12 +160,9 @@ def write_card(path: Path, manifest: dict[str, Any], clips: list[dict[str, Any]]
     path : of the card; the histograms lie beside it.
     manifest, clips : as for `card`.
     """
-    from hesim_render.core.output import replacing
-
     with replacing(path.with_name(HISTOGRAM_FILE)) as unfinished:
         unfinished.write_bytes(histograms(clips))
-    with replacing(path) as unfinished:
-        unfinished.write_text(card_header(manifest) + "\n" + card(manifest, clips), encoding="utf-8")
+    write_whole(path, card_header(manifest) + "\n" + card(manifest, clips))
 
 
 CROISSANT_FILE = "croissant.json"

@@ -180,7 +180,9 @@ def _fill(plan: BenchmarkPlan, clip: Clip, folder: Path, target: Path) -> dict[s
     seed = spec.seeds[clip.seed]
     # one renderer for both: what rests is rendered once
     renderer = _renderer(plan, clip, scene, sensor)
-    with _journal(plan, clip, target, scene, sensor) as journal:
+    run, others = _run_of(plan, clip, scene, sensor), journals_in(target)
+    # what has been traced, here and in spans, for a build that goes on within a long clip
+    with Journal(target, run, overwrite=True, shared=True, after_s=_KEPT_AFTER_S, others=others) as journal:
         renderer.go_on(journal)
         recording = simulate(
             scene, sensor, duration_s=spec.duration_s, seed=seed, clean=level.clean, without=level.without,
@@ -217,12 +219,6 @@ def _fill(plan: BenchmarkPlan, clip: Clip, folder: Path, target: Path) -> dict[s
             if path.is_file()
         },
     }
-
-
-def _journal(plan: BenchmarkPlan, clip: Clip, target: Path, scene: Scene, sensor: Sensor) -> Journal:
-    """What the renderer of a clip has traced, here and in spans, for a build that goes on within a long clip."""
-    run, others = _run_of(plan, clip, scene, sensor), journals_in(target)
-    return Journal(target, run, overwrite=True, shared=True, after_s=_KEPT_AFTER_S, others=others)
 
 
 def _run_of(plan: BenchmarkPlan, clip: Clip, scene: Scene, sensor: Sensor) -> dict[str, Any]:

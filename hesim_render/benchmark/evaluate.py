@@ -17,7 +17,7 @@ from hesim_render.benchmark.tasks import TASKS, ClipTasks, Score
 from hesim_render.benchmark.verify import digest_of
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
 from hesim_render.core.guard import WholeFile
-from hesim_render.core.output import check_place, replacing
+from hesim_render.core.output import check_place, write_whole
 from hesim_render.core.plain import as_plain
 from hesim_render.core.progress import Progress
 from hesim_render.specs.benchmark import SPLITS
@@ -130,8 +130,7 @@ def evaluate_benchmark(
         "scores": [vars(score) for score in scores],
     }
     if target is not None:
-        with replacing(target) as unfinished:
-            unfinished.write_text(json.dumps(as_plain(result), indent=1) + "\n", encoding="utf-8")
+        write_whole(target, json.dumps(as_plain(result), indent=1) + "\n")
     return result
 
 

@@ -116,7 +116,8 @@ class LocalWorkers:
                             if unit.clip.name in failed:
                                 pass
                             elif deaths[unit] >= MOST_DEATHS:
-                                error = f"its worker died {MOST_DEATHS} times (last: {_cause(status)})"
+                                cause = f"signal {-status}" if status < 0 else f"exit status {status}"
+                                error = f"its worker died {MOST_DEATHS} times (last: {cause})"
                                 error = error if unit.span is None else f"{unit}: {error}"
                                 fail(unit, {"name": unit.clip.name, "error": error})
                             else:
@@ -175,7 +176,3 @@ class LocalWorkers:
                 worker.process.wait()
         self._workers.clear()
         self._waits.close()
-
-
-def _cause(status: int) -> str:
-    return f"signal {-status}" if status < 0 else f"exit status {status}"

@@ -28,7 +28,7 @@ from hesim_render.capture.run_settings import noise_models
 from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.core.guard import printable
-from hesim_render.core.output import check_place, replacing
+from hesim_render.core.output import check_place, write_whole
 from hesim_render.core.plain import as_plain
 from hesim_render.core.progress import Progress
 from hesim_render.exchange import EventStream
@@ -116,8 +116,7 @@ def compare_peers(
         "render_error": errors, "rows": rows,
     }  # fmt: skip
     if target is not None:
-        with replacing(target) as unfinished:
-            unfinished.write_text(json.dumps(as_plain(result), indent=1) + "\n", encoding="utf-8")
+        write_whole(target, json.dumps(as_plain(result), indent=1) + "\n")
     return result
 
 

@@ -16,9 +16,9 @@ from hesim_render.calibration.spec import SCHEMA_VERSION
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.core.guard import WholeFile
 from hesim_render.core.npz import NpzWriter
-from hesim_render.core.output import alone_in, check_place, output_errors, replacing
+from hesim_render.core.output import alone_in, check_place, output_errors, replacing, write_whole
 from hesim_render.core.plain import as_plain
-from hesim_render.core.yaml_file import write_yaml
+from hesim_render.core.yaml_file import yaml_text
 
 __all__ = ["check_calibration", "plain", "read_calibration", "read_maps", "write_section"]
 
@@ -64,8 +64,7 @@ def _write_section(
                 archive.add(name, np.asarray(array))
         about = {"file": target.name, "sha256": WholeFile(target).sha256(), **{name: name for name in names}}
         whole = {**data, section: {**content, "maps": about}}
-        with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
-            write_yaml(plain(whole), stream)
+        write_whole(path, yaml_text(plain(whole)))
     finally:
         with contextlib.suppress(OSError, SpecError):  # not what was asked for, and the next run does it
             _remove_unnamed(path, section)

@@ -104,7 +104,20 @@ class TelegraphPerFrame(RateMaps):
 
 
 @dataclass(frozen=True, eq=False)
-class EventDefectRates(RateMaps):
+class _EventDefects(RateMaps):
+    """Maps that begin with the kind of defect, which is called ``defect`` in a file."""
+
+    PREFIX: ClassVar[str] = "defect_"
+    kind: NDArray
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Names of the maps in a file."""
+        return ("defect", *super().names()[1:])
+
+
+@dataclass(frozen=True, eq=False)
+class EventDefectRates(_EventDefects):
     """Event pixels that are stuck or give events of their own, [y, x].
 
     Attributes
@@ -115,34 +128,20 @@ class EventDefectRates(RateMaps):
     change_hz : 1/(mean time firing) + 1/(mean time quiet), Hz; 0 of pixels that do not flicker.
     """
 
-    PREFIX: ClassVar[str] = "defect_"
-    kind: NDArray
     on_hz: NDArray
     off_hz: NDArray
     firing_share: NDArray
     change_hz: NDArray
 
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Names of the maps in a file."""
-        return ("defect", *super().names()[1:])
-
 
 @dataclass(frozen=True, eq=False)
-class EventDefectsPerTrial(RateMaps):
+class EventDefectsPerTrial(_EventDefects):
     """What counts tell of `EventDefectRates`: chances of an event in a comparison, and the correlation of the state."""
 
-    PREFIX: ClassVar[str] = "defect_"
-    kind: NDArray
     on_per_trial: NDArray
     off_per_trial: NDArray
     firing_share: NDArray
     correlation: NDArray
-
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Names of the maps in a file."""
-        return ("defect", *super().names()[1:])
 
     @property
     def misbehaves(self) -> bool:

@@ -4,7 +4,6 @@ Frames and events come from the same noise models and the same event stage as in
 is that of `hesim_render.capture.bench`.
 """
 
-import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from hesim_render.core.npz import NpzWriter
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
-from hesim_render.core.yaml_file import write_yaml
+from hesim_render.core.yaml_file import yaml_text
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.sensor.reading import read_sensor
 from hesim_render.sensor.sensor import Sensor, as_sensor
@@ -294,7 +293,8 @@ def _describe(bench: Bench, folder: Path, illuminant: str, seed: int, longest_us
         read_sensor(bench.sensor.file)
     ) == content_hash(spec)
     if not shipped:
-        _dump(spec.model_dump(mode="json", exclude_none=True, exclude={"noise"}), folder / "sensor.yaml")
+        content_of_sensor = spec.model_dump(mode="json", exclude_none=True, exclude={"noise"})
+        (folder / "sensor.yaml").write_text(yaml_text(content_of_sensor), encoding="utf-8")
     tile_rows, tile_cols = layout.tile_shape
     content: dict[str, object] = {
         "bit_depth": 16 if bench.aps is None else bench.aps.spec.bit_depth,
@@ -321,10 +321,4 @@ def _describe(bench: Bench, folder: Path, illuminant: str, seed: int, longest_us
         f"brightest patch; seed {seed}"
     )
     content["truth"] = truth_of(bench, longest_us)
-    _dump(content, folder / CAPTURE_NAME)
-
-
-def _dump(content: Mapping[str, object], file: Path) -> None:
-    text = io.StringIO()
-    write_yaml(dict(content), text)
-    file.write_text(text.getvalue(), encoding="utf-8")
+    (folder / CAPTURE_NAME).write_text(yaml_text(content), encoding="utf-8")

@@ -7,7 +7,7 @@ import typer
 
 from hesim_render.cli.console import Console, DryRun, Json, Quiet, facts_of
 from hesim_render.cli.exit_status import ExitStatus
-from hesim_render.cli.options import LONG_MINUTES, HelpAll, Overwrite, Yes, listed
+from hesim_render.cli.options import LONG_MINUTES, FileKeys, HelpAll, Overwrite, Yes, listed
 from hesim_render.cli.terminal import complain
 from hesim_render.core.errors import RangeError, TooLongError, did_you_mean
 from hesim_render.core.output import free_place
@@ -37,9 +37,7 @@ def build(
     ] = 1.0,
     estimate: Annotated[bool, typer.Option(help="estimate time and size before the start")] = True,
     yes: Yes = False,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a key of the YAML file")
-    ] = None,
+    set_: FileKeys = None,
     dry_run: DryRun = False,
     json_: Json = False,
     quiet: Quiet = False,
@@ -229,9 +227,7 @@ def export(
 def peers(
     spec: Annotated[Path, typer.Argument(help="YAML file of the comparison")],
     out: Annotated[Path | None, typer.Option(help="JSON file of the result")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a key of the YAML file")
-    ] = None,
+    set_: FileKeys = None,
     run_programs: Annotated[
         bool, typer.Option("--run-programs", help="let the programs run that the file names; read it before")
     ] = False,

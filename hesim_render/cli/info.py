@@ -14,7 +14,7 @@ from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.options import HelpAll, Overwrite, SensorKeys, names_of, sensor_keys_only
 from hesim_render.cli.terminal import complain, say, split_overrides
 from hesim_render.core.errors import ConflictError, RangeError, did_you_mean
-from hesim_render.core.output import free_place, replacing
+from hesim_render.core.output import free_place, write_whole
 from hesim_render.core.shipped import list_names
 
 #: Keys of a sensor file that its line needs.
@@ -251,6 +251,5 @@ def new(
     else:
         known = (*_KINDS, *list_names("sensors"))
         raise RangeError("--like", like, f"one of {', '.join(known)}{did_you_mean(like, known)}")
-    with replacing(out) as unfinished:
-        unfinished.write_text(text, encoding="utf-8")
+    write_whole(out, text)
     say(f"{out}: a sensor file; look at it with 'hesim-render info {out}'")

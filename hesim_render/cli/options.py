@@ -70,6 +70,9 @@ SensorKeys = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="sensor.KEY=VALUE", help="change a key of the sensor file; repeatable"),
 ]
+FileKeys = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a key of the file; repeatable")
+]
 Clean = Annotated[bool, typer.Option("--clean", help="no noise at all")]
 Without = Annotated[
     list[str] | None,

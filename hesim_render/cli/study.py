@@ -7,7 +7,7 @@ import typer
 
 from hesim_render.cli.console import Console, DryRun, Json, Quiet
 from hesim_render.cli.exit_status import ExitStatus
-from hesim_render.cli.options import HelpAll, Overwrite, names_of
+from hesim_render.cli.options import FileKeys, HelpAll, Overwrite, names_of
 from hesim_render.core.errors import ConflictError
 from hesim_render.core.output import check_target
 
@@ -39,9 +39,7 @@ def study(
             help="surfaces of a comparison, in place of its own: a scene, a cube, patches; repeatable",
         ),
     ] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a key of the file; repeatable")
-    ] = None,
+    set_: FileKeys = None,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
     json_: Json = False,

@@ -231,6 +231,12 @@ def replacing(target: Path) -> Iterator[Path]:
             raise
 
 
+def write_whole(target: Path, text: str) -> None:
+    """Write a text as a file that appears whole or not at all, as `replacing` does."""
+    with replacing(target) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+
+
 @contextlib.contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
     """Keep other runs from changing files of a folder that belong together, while they are read, changed and written.

@@ -1,9 +1,10 @@
 """YAML files: read without trust in their size, depth or aliases, and written."""
 
 import functools
+import io
 import pickle
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
@@ -63,20 +64,21 @@ def _parsed(text: str, kind: str) -> bytes:
     return pickle.dumps(YAML(typ=kind).load(text))
 
 
-def write_yaml(content: object, stream: IO[str], width: int = 110, is_sorted: bool = False) -> None:
-    """Write plain values as YAML, short lists and mappings on one line each.
+def yaml_text(content: object, width: int = 110, is_sorted: bool = False) -> str:
+    """Plain values as YAML, short lists and mappings on one line each.
 
     Parameters
     ----------
     content : mappings, lists, texts and numbers.
-    stream : what takes the text.
     width : of a line, characters.
     is_sorted : keys in alphabetical order; default in their own.
     """
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style, yaml.width = None, width
     yaml.sort_base_mapping_type_on_output = is_sorted  # type: ignore[assignment]  # ruamel declares None
+    stream = io.StringIO()
     yaml.dump(content, stream)
+    return stream.getvalue()
 
 
 def _check_aliases(text: str, file: Path) -> None:

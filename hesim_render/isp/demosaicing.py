@@ -120,17 +120,13 @@ def _targets(block: NDArray, channel: int) -> tuple[list[tuple[int, int]], list[
     return known, [(int(i), int(j)) for i, j in np.argwhere(block != channel)]
 
 
-def _as_key(block: NDArray) -> kriging.Block:
-    return tuple(tuple(int(value) for value in row) for row in block)
-
-
 def _linear(planes: NDArray[np.float32], block: NDArray, channel: int) -> NDArray[np.float32]:
     known, wanted = _targets(block, channel)
     out = np.empty((*block.shape, planes.shape[1] - 2, planes.shape[2] - 2), dtype=np.float32)
     for row, col in known:
         out[row, col] = planes[row * block.shape[1] + col, 1:-1, 1:-1]
     # each missing place of a block is a fixed sum of the values around, one stencil for all blocks
-    weights = kriging.stencil(_as_key(block), channel, tuple(wanted))
+    weights = kriging.stencil(tuple(map(tuple, block.tolist())), channel, tuple(wanted))
     rows_of, cols_of = np.array(wanted).T
 
     def work(rows: slice) -> None:

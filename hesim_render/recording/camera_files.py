@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.output import output_errors
-from hesim_render.core.yaml_file import write_yaml
+from hesim_render.core.yaml_file import yaml_text
 from hesim_render.sources.render.truth.poses import CameraModel
 from hesim_render.sources.render.truth.raster import Grid
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
@@ -110,5 +110,4 @@ def write_kalibr_aprilgrid(
 
 def write_kalibr(path: Path, content: dict[str, Any]) -> None:
     """Write plain values as YAML, each list on one line."""
-    with path.open("w", encoding="utf-8") as stream:
-        write_yaml(json.loads(json.dumps(content)), stream, width=200)
+    path.write_text(yaml_text(json.loads(json.dumps(content)), width=200), encoding="utf-8")

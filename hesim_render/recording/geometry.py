@@ -4,8 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.layout import Layout
 from hesim_render.recording import manifest as manifests
@@ -74,9 +72,4 @@ def scene_of(section: Mapping[str, Any], file: Path | None, remedy: str) -> Scen
             file=file,
             key="scene.files_sha256",
         )
-    try:
-        return Scene(SceneSpec.model_validate(section["spec"]))
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        key = ".".join(["scene", "spec", *map(str, problem["loc"])])
-        raise SpecError(problem["msg"].removeprefix("Value error, "), file=file, key=key) from None
+    return Scene(manifests.model_of(SceneSpec, section["spec"], file, "scene.spec"))

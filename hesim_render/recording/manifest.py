@@ -5,7 +5,7 @@ import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
@@ -14,14 +14,12 @@ from hesim_render.core.guard import WholeFile, inside
 from hesim_render.mosaic import description as mosaic
 from hesim_render.recording.dng import noise_profile
 from hesim_render.recording.manifest_spec import RecordingSpec
-from hesim_render.specs.files import content_hash, validate
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.specs.files import Model, content_hash, validate
 from hesim_render.specs.lens import LENS_TERMS
 from hesim_render.specs.light import mixed_light
 from hesim_render.specs.reflectance import TextureSpec, leaves_of
 from hesim_render.specs.sensor import SensorSpec
-
-if TYPE_CHECKING:
-    from hesim_render.sensor.sensor import Sensor
 
 MANIFEST_NAME = "recording.json"
 SCHEMA_VERSION = 1
@@ -48,7 +46,7 @@ MASKS = {
 
 
 def build(
-    sensor: "Sensor",
+    sensor: Sensor,
     *,
     scene: BaseModel | None,
     seed: int,
@@ -181,10 +179,26 @@ def sensor_spec(manifest: Mapping[str, Any], folder: Path | None = None) -> Sens
     SpecError
         If the manifest holds no sensor that this version knows.
     """
+    file = None if folder is None else folder / MANIFEST_NAME
+    return model_of(SensorSpec, manifest["sensor"]["spec"], file, "sensor.spec")
+
+
+def model_of(model: type[Model], content: Any, file: Path | None, place: str) -> Model:
+    """The model of a part of a manifest.
+
+    Parameters
+    ----------
+    model, content : what is made of what.
+    file, place : the manifest and the dotted key of the part, for the error.
+
+    Raises
+    ------
+    SpecError
+        If the content is not valid; the message names the first wrong key.
+    """
     try:
-        return SensorSpec.model_validate(manifest["sensor"]["spec"])
+        return model.model_validate(content)
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
-        key = ".".join(["sensor", "spec", *map(str, problem["loc"])])
-        place = None if folder is None else folder / MANIFEST_NAME
-        raise SpecError(problem["msg"].removeprefix("Value error, "), file=place, key=key) from None
+        key = ".".join([place, *map(str, problem["loc"])])
+        raise SpecError(problem["msg"].removeprefix("Value error, "), file=file, key=key) from None

@@ -3,7 +3,6 @@
 Plots of a recording: its pictures, events over time, and the distribution of RAW values.
 """
 
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,9 +12,9 @@ import numpy as np
 from hesim_render.core.drawing import COLOURS, new_figure, report_style, svg
 from hesim_render.core.guard import printable
 from hesim_render.core.html import filled, inline_picture, table, tick_text
-from hesim_render.core.output import replacing
+from hesim_render.core.output import write_whole
 from hesim_render.core.units import US_PER_S
-from hesim_render.core.yaml_file import write_yaml
+from hesim_render.core.yaml_file import yaml_text
 from hesim_render.events import event_rate
 from hesim_render.recording.outline import parameters, scene_name
 from hesim_render.recording.quality import render_lines
@@ -135,9 +134,8 @@ def write_page(recording: Recorded, folder: Path) -> Path:
         details=[*specifications, ("Versions", _as_yaml(manifest.get("software", {})))],
     )  # fmt: skip
     target = folder / PAGE
-    with replacing(target) as unfinished:
-        # names in a recording from elsewhere may hold anything
-        unfinished.write_text("\n".join(map(printable, page.split("\n"))), encoding="utf-8")
+    # names in a recording from elsewhere may hold anything
+    write_whole(target, "\n".join(map(printable, page.split("\n"))))
     return target
 
 
@@ -169,6 +167,4 @@ def _short(node: Any) -> Any:
 
 
 def _as_yaml(node: Any) -> str:
-    stream = io.StringIO()
-    write_yaml(node, stream, is_sorted=True)
-    return "" if not node else stream.getvalue()
+    return yaml_text(node, is_sorted=True) if node else ""

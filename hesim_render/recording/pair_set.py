@@ -236,9 +236,8 @@ def _arranged(file: Path, spec: CaptureSpec, shape: tuple[int, int], series: lis
         if len(entry.files) < 2:
             only = f"{printable(entry.files[0].name)} alone" if entry.files else "no frame"
             raise entry.error(f"{only}; a pair has two frames, and a variance follows from their difference")
-    pairs = {
-        lit: sorted((s for s in series if s.lit == lit and len(s.files) == 2), key=_order) for lit in (True, False)
-    }
+    ordered = sorted(series, key=lambda entry: (entry.photons or 0.0, entry.exposure_s))
+    pairs = {lit: [entry for entry in ordered if entry.lit == lit and len(entry.files) == 2] for lit in (True, False)}
     if len(pairs[True]) < _FEWEST_EXPOSURES:
         problem = f"{len(pairs[True])} lit pairs; EMVA 1288 asks for 50, and {_FEWEST_EXPOSURES} are the fewest"
         raise SpecError(problem, file=file)
@@ -296,7 +295,3 @@ def _same(first_s: float, second_s: float) -> bool:
 def light_of_series(series: Series, has_photons: bool) -> float:
     """Photons per pixel of a series, or its exposure in s where photons are not stated."""
     return series.photons or 0.0 if has_photons else series.exposure_s
-
-
-def _order(series: Series) -> tuple[float, float]:
-    return series.photons or 0.0, series.exposure_s

@@ -109,7 +109,7 @@ def contact_sheet(recording: Recorded) -> Image.Image:
     title = "  ·  ".join(
         part
         for part in (
-            scene, mosaic.sensor, f"{_size(recording)} px", _ms(recording.duration_us),
+            scene, mosaic.sensor, f"{roi['width_px']}x{roi['height_px']} px", _ms(recording.duration_us),
             counted(counts["frames"], "frame"), counted(counts["events"], "event"),
             f"seed {recording.manifest['seed']}",
         )
@@ -156,11 +156,6 @@ def animation(recording: Recorded) -> list[Picture]:
         events = recording.event_slice(int(first), int(last)) if last > first else no_events()
         pictures.append(events_picture(background, events, recording.event_shape))
     return pictures
-
-
-def _size(recording: Recorded) -> str:
-    roi = recording.manifest["roi"]
-    return f"{roi['width_px']}x{roi['height_px']}"
 
 
 def _ms(microseconds: int) -> str:

@@ -184,7 +184,7 @@ def scene_and_sensor(scene: Scene | str | Path, sensor: Sensor | str | Path) -> 
     SpecError
         If a file is not valid.
     """
-    if _is_sensor(scene) or _is_scene(sensor):
+    if _is_a(scene, Sensor, "sensors", "scenes") or _is_a(sensor, Scene, "scenes", "sensors"):
         raise ConflictError("scene", scene, f"the scene comes first, then the sensor; given were {scene!r}, {sensor!r}")
     if isinstance(scene, str | Path):
         scene = load_scene(scene)
@@ -195,12 +195,9 @@ def scene_and_sensor(scene: Scene | str | Path, sensor: Sensor | str | Path) -> 
     return scene, as_sensor(sensor)
 
 
-def _is_sensor(given: object) -> bool:
-    return isinstance(given, Sensor) or (str(given) in list_names("sensors") and str(given) not in list_names("scenes"))
-
-
-def _is_scene(given: object) -> bool:
-    return isinstance(given, Scene) or (str(given) in list_names("scenes") and str(given) not in list_names("sensors"))
+def _is_a(given: object, kind: type, names: str, others: str) -> bool:
+    """True for an object of a kind, and for a name that only things of this kind have."""
+    return isinstance(given, kind) or (str(given) in list_names(names) and str(given) not in list_names(others))
 
 
 def light_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:

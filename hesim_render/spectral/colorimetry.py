@@ -68,11 +68,8 @@ def encode_srgb(linear: ArrayLike) -> NDArray[np.uint8]:
     return _SRGB_TABLE[(steps + 0.5).astype(np.uint16)]
 
 
-def _srgb_table() -> NDArray[np.uint8]:
-    return np.rint(255 * encode_exactly(np.linspace(0.0, 1.0, 4096) ** 2, "srgb")).astype(np.uint8)
-
-
-_SRGB_TABLE = _srgb_table()
+#: Codes of sRGB, 8 bits, at even steps of the square root of the linear value.
+_SRGB_TABLE = np.rint(255 * encode_exactly(np.linspace(0.0, 1.0, 4096) ** 2, "srgb")).astype(np.uint8)
 
 
 def lab_of(ratios: Triple, xp: Namespace = NUMPY) -> Triple:

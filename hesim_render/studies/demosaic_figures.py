@@ -176,7 +176,8 @@ def _figures(rgb: NDArray[np.float64], reflectance: NDArray[np.float64]) -> dict
     """Figures of a picture without noise, [row, col, 3], white at 1."""
     side = SIDE_PX
     edge, star, zone = (np.s_[:, k * side : (k + 1) * side] for k in range(3))
-    colours = lab(rgb @ _SRGB_TO_XYZ.T, _SRGB_TO_XYZ.sum(axis=1))
+    white = _SRGB_TO_XYZ.sum(axis=1)
+    colours = lab(rgb @ _SRGB_TO_XYZ.T, white)
     chroma = np.hypot(colours[..., 1], colours[..., 2])
     luminance = rgb @ _LUMINANCE
     inner = np.s_[8:-8, 8:-8]  # the demosaicing meets its own border, or the next pattern
@@ -192,7 +193,7 @@ def _figures(rgb: NDArray[np.float64], reflectance: NDArray[np.float64]) -> dict
     return {
         "mtf50_cy_per_px": None if np.isnan(mtf50) else float(mtf50),
         "false_colour": float(own[near].mean() - own[away].mean()),
-        "zipper": zipper(colours[edge][inner], _grey_lab(reflectance[edge][inner]), near),
+        "zipper": zipper(colours[edge][inner], lab(reflectance[edge][inner][..., None] * white, white), near),
         "star_error": float(np.sqrt(np.mean(off**2)) / (LIGHT - DARK)),
         "zone_plate_colour": float(chroma[zone][radius < side / 2 - 8].mean()),
     }
@@ -203,11 +204,6 @@ def _ring() -> NDArray[np.bool_]:
     """The judged part of the star, [row, col]."""
     frequency = SPOKES / (2 * np.pi * np.maximum(distance_px(), 1e-9))
     return (frequency > _STAR_BAND[0]) & (frequency < _STAR_BAND[1])
-
-
-def _grey_lab(reflectance: NDArray[np.float64]) -> NDArray[np.float64]:
-    white = _SRGB_TO_XYZ.sum(axis=1)
-    return lab(reflectance[..., None] * white, white)
 
 
 def zipper(colours: NDArray[np.float64], true: NDArray[np.float64], chosen: NDArray[np.bool_]) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress, shown
-from hesim_render.core.yaml_file import write_yaml
+from hesim_render.core.yaml_file import yaml_text
 from hesim_render.specs.design import DesignSpec
 from hesim_render.specs.files import read_spec
 from hesim_render.specs.filter_set import FilterSetSpec, read_palette
@@ -179,8 +179,8 @@ def _verdicts(spec: DesignSpec, table: Table) -> list[dict[str, Any]]:
 
 
 def _write_yaml(path: Path, content: Mapping[str, Any]) -> None:
-    with output_errors(path), path.open("w", encoding="utf-8") as file:
-        write_yaml(dict(content), file, width=120)
+    with output_errors(path):
+        path.write_text(yaml_text(dict(content), width=120), encoding="utf-8")
 
 
 def designed_set(problem: Problem, result: DesignResult) -> FilterSetSpec:

@@ -207,7 +207,8 @@ def pareto_plot(rows: Table, title: str) -> str:
     """SVG of colour error against luminance SNR, one point a filter set; the front is a line. Hollow: white clips."""
     figure, axes = panel(title, "mean ΔE2000, noise-aware matrix", "YSNR of an 18 % grey card, noise-aware", (400, 300))
     rows = Table(row for row in rows if all(row[name] is not None for name in PARETO))
-    error, snr, clipped, names = rows[PARETO[0]], rows[PARETO[1]], rows["white_clipped"].astype(bool), _labels(rows)
+    error, snr, clipped = rows[PARETO[0]], rows[PARETO[1]], rows["white_clipped"].astype(bool)
+    names = _labels([(row["filter_set"], row["sensor"], row["crosstalk"]) for row in rows])
     for k, name in enumerate(dict.fromkeys(names)):
         own = np.array([other == name for other in names])
         clips = bool(clipped[own].any())
@@ -297,21 +298,15 @@ def chart_picture(seen: Seen) -> NDArray[np.uint8]:
 
 def seen_labels(group: Sequence[Seen]) -> list[str]:
     """Names of the filter sets, with sensor and crosstalk where there are several."""
-    several = len({each.candidate.sensor_name for each in group}) > 1
-    crossed = len({each.candidate.crosstalk for each in group}) > 1
-    return [
-        each.candidate.set_name + (f", {each.candidate.sensor_name}" if several else "")
-        + (f", crosstalk {each.candidate.crosstalk:g}" if crossed else "")
-        for each in group
-    ]  # fmt: skip
+    every = [each.candidate for each in group]
+    return _labels([(each.set_name, each.sensor_name, each.crosstalk) for each in every])
 
 
-def _labels(rows: Table) -> list[str]:
-    """Names of the filter sets, with the sensor where there are several."""
-    several = len(set(rows["sensor"])) > 1
-    crossed = len(set(rows["crosstalk"])) > 1
+def _labels(named: Sequence[tuple[object, ...]]) -> list[str]:
+    """Texts of filter set, sensor and crosstalk, the last two where there are several."""
+    _, sensors, crosstalks = map(set, zip(*named, strict=True))
     return [
-        str(row["filter_set"]) + (f", {row['sensor']}" if several else "")
-        + (f", crosstalk {row['crosstalk']:g}" if crossed else "")
-        for row in rows
+        str(name) + (f", {sensor}" if len(sensors) > 1 else "")
+        + (f", crosstalk {crosstalk:g}" if len(crosstalks) > 1 else "")
+        for name, sensor, crosstalk in named
     ]  # fmt: skip

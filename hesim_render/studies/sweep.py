@@ -3,7 +3,7 @@
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -11,7 +11,7 @@ from typing import Any, Literal
 from hesim_render.capture.simulate import simulate
 from hesim_render.core.errors import HesimError, OutputError, SpecError, did_you_mean
 from hesim_render.core.guard import WholeFile
-from hesim_render.core.output import check_target, output_errors, replacing
+from hesim_render.core.output import check_target, output_errors, write_whole
 from hesim_render.core.progress import Progress, shown
 from hesim_render.core.region import parse_roi
 from hesim_render.core.yaml_file import read_yaml
@@ -117,12 +117,10 @@ def sweep(
     runs = list(runs_of(read))
     with output_errors(folder):
         (folder / "runs").mkdir(parents=True, exist_ok=True)
-        content = json.dumps(json.loads(read.model_dump_json()), indent=1)
-        with replacing(folder / MARKER) as unfinished:
-            unfinished.write_text(content + "\n", encoding="utf-8")
+        write_whole(folder / MARKER, json.dumps(json.loads(read.model_dump_json()), indent=1) + "\n")
     made = _made(read, folder)
     # runs that differ in the ISP alone come one after the other, so that they share a recording
-    first = _first_of_each(runs)
+    first = {run.simulation: k for k, run in reversed(list(enumerate(runs)))}
     order = sorted(range(len(runs)), key=lambda k: (first[runs[k].simulation], k))
     result: dict[int, list[dict[str, Cell]]] = {}
     with shown(progress, read.name) as report:
@@ -157,13 +155,6 @@ def _file_of(folder: Path, made: "_Studies | _Recordings", run: Run) -> Path:
     return folder / "runs" / f"{_digest(made.identity(run))}.json"
 
 
-def _first_of_each(runs: Sequence[Run]) -> dict[str, int]:
-    result: dict[str, int] = {}
-    for k, run in enumerate(runs):
-        result.setdefault(run.simulation, k)
-    return result
-
-
 def _rows(made: "_Studies | _Recordings", run: Run, folder: Path) -> list[dict[str, Cell]]:
     """Rows of a run, from its file if there is one."""
     combination = ", ".join(f"{key}={value}" for key, value in run.cells.items())
@@ -181,8 +172,7 @@ def _rows(made: "_Studies | _Recordings", run: Run, folder: Path) -> list[dict[s
         raise
     except HesimError as error:
         raise SpecError(f"run with {combination}: {str(error).splitlines()[0]}") from None
-    with replacing(file) as unfinished:
-        unfinished.write_text(json.dumps({"run": run.cells, "rows": rows}) + "\n", encoding="utf-8")
+    write_whole(file, json.dumps({"run": run.cells, "rows": rows}) + "\n")
     return rows
 
 

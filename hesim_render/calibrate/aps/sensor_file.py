@@ -5,7 +5,7 @@ from pathlib import Path
 
 from hesim_render.calibrate.aps.pair_levels import WELL_SHARE
 from hesim_render.calibrate.aps.pairs import PairCalibration
-from hesim_render.core.output import output_errors, replacing
+from hesim_render.core.output import write_whole
 
 _TEXT = """\
 # Written by `hesim-render calibrate` with {calibration}, whose noise replaces the figures of `aps` below. What the
@@ -83,6 +83,5 @@ def write_sensor(file: str | Path, calibration: str | Path, result: PairCalibrat
         well_note="largest signal of the captures" if limited else
         "not seen in the captures, which the ADC limits; a quarter above full scale",
     )  # fmt: skip
-    with output_errors(path), replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_whole(path, text)
     return path

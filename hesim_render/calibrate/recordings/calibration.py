@@ -14,8 +14,8 @@ from hesim_render.calibrate.recordings.short_intervals import dead_time, readout
 from hesim_render.calibrate.recordings.tally import EventTally, tally
 from hesim_render.calibrate.result import plain
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.core.output import free_place, replacing
-from hesim_render.core.yaml_file import write_yaml
+from hesim_render.core.output import free_place, write_whole
+from hesim_render.core.yaml_file import yaml_text
 from hesim_render.exchange import open_events
 
 #: Thresholds follow from the leak, and the leak from the thresholds.
@@ -87,8 +87,7 @@ def calibrate_recordings(
         tallies, moving, None if lux is None else [float(level) for level in lux], target_contrast, target_hz, first
     )
     if path is not None:
-        with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8") as file:
-            write_yaml(plain(result), file, width=120)
+        write_whole(Path(path), yaml_text(plain(result), width=120))
     return result
 
 

@@ -4,6 +4,7 @@ import contextlib
 import re
 from array import array
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ class FileVideo(Hashed):
         self._open()
         self._pts, timing, self.count = self._scan()
         if fps is not None:
-            timing = Timing.regular(self.count, fps) if timing is None else _retimed(timing, self.count, fps)
+            timing = replace(Timing.regular(self.count, fps), cut_short="" if timing is None else timing.cut_short)
         self.timing = timing
         self._open()
         frame, self._first = self._decoded()
@@ -219,8 +220,3 @@ def _checksum_errors() -> Iterator[list[str]]:
             result += [text for *_, text in logs if "CRC mismatch" in text]
     finally:
         av.logging.set_level(before)
-
-
-def _retimed(timing: Timing, count: int, fps: float) -> Timing:
-    regular = Timing.regular(count, fps)
-    return Timing(regular.begin_s, regular.end_s, timing.cut_short)
