@@ -1,7 +1,7 @@
 """Measured maps of the calibration named in a sensor file, cut to the region that is read out."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,35 +76,43 @@ def frame_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
 
 def telegraph_rates(layout: Layout) -> TelegraphRates | None:
     """Random telegraph noise of each pixel of the region, [row, col]; None if not measured."""
-    return _rates(TelegraphRates, TelegraphPerFrame, layout, "aps", _frame_region)
+    # per second where the calibration has it; those of captures without an interval are per frame
+    known = _all_of(TelegraphRates, layout, "aps", _frame_region)
+    if known is not None:
+        return known
+    counted = _all_of(TelegraphPerFrame, layout, "aps", _frame_region)
+    return None if counted is None else counted.per_second(_interval_s(layout, "aps"))
 
 
 def event_defect_rates(layout: Layout) -> EventDefectRates | None:
     """Defects of each event pixel of the region, [y, x]; None if not measured."""
-    return _rates(EventDefectRates, EventDefectsPerTrial, layout, "evs", _event_region)
+    known = _all_of(EventDefectRates, layout, "evs", _event_region)
+    if known is not None:
+        return known
+    counted = _all_of(EventDefectsPerTrial, layout, "evs", _event_region)
+    return None if counted is None else counted.per_second(_interval_s(layout, "evs"))
 
 
 _Placed = tuple[Mapping[str, NDArray], tuple[int, int]]
-_Cut = Callable[[Layout, _Placed, tuple[str, ...]], dict[str, NDArray]]
 _Kind = TypeVar("_Kind", bound=RateMaps)
 
 
-def _rates(kind: type[_Kind], counted: Any, layout: Layout, section: str, cut: _Cut) -> _Kind | None:
-    """Rates per second where the calibration has them, or those of `counted`, from captures without an interval."""
-    known = _all_of(kind, layout, section, cut)
-    if known is not None:
-        return known
-    result = _all_of(counted, layout, section, cut)
-    # without an interval no pixel misbehaves: the calibration would have been refused
-    return None if result is None else result.per_second(_maps_of(layout).intervals_s[section] or 1.0)
-
-
-def _all_of(kind: type[_Kind], layout: Layout, section: str, cut: _Cut) -> _Kind | None:
+def _all_of(
+    kind: type[_Kind],
+    layout: Layout,
+    section: str,
+    cut: Callable[[Layout, _Placed, tuple[str, ...]], dict[str, NDArray]],
+) -> _Kind | None:
     """Maps of one kind over the region, all of them or none."""
     result = _read(layout, section, kind.names())
     if result is None or len(result[0]) < len(kind.names()):
         return None
     return kind.of(cut(layout, result, kind.names()))
+
+
+def _interval_s(layout: Layout, section: str) -> float:
+    # without an interval no pixel misbehaves: the calibration would have been refused
+    return _maps_of(layout).intervals_s[section] or 1.0
 
 
 def _maps_of(layout: Layout) -> MeasuredMaps:

@@ -82,10 +82,10 @@ class Strict(BaseModel):
 def text_means(*keys: str) -> Any:
     """A check of a model: a text in its place is the value of these keys."""
 
-    def check(cls: type[BaseModel], data: Any) -> Any:
+    def check(data: Any) -> Any:
         return dict.fromkeys(keys, data) if isinstance(data, str) else data
 
-    return model_validator(mode="before")(classmethod(check))
+    return model_validator(mode="before")(check)
 
 
 class InFolder(Strict):
