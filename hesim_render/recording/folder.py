@@ -40,18 +40,14 @@ class FolderWriter:
         self._labels: LabelFileWriter | None = None
         self._objects_at: Callable[[NDArray, NDArray, NDArray], NDArray[np.uint16]] | None = None
         time, grid = manifest["time"], manifest["event_grid"]
+        self._grid_and_time = (grid["height"], grid["width"]), time["begin_us"], time["end_us"]
         try:
             with output_errors(self._folder.target):
                 for name in ("frames", "truth"):
                     (self._folder.path / name).mkdir()
                 self._valid = self._mosaic_mask()
                 np.save(self._folder.path / "truth" / "valid.npy", self._valid)
-                self._events = EventFileWriter(
-                    self._folder.path / "events.h5",
-                    (grid["height"], grid["width"]),
-                    time["begin_us"],
-                    time["end_us"],
-                )
+                self._events = EventFileWriter(self._folder.path / "events.h5", *self._grid_and_time)
         except BaseException:
             self._folder.discard()
             raise
@@ -99,11 +95,9 @@ class FolderWriter:
             )
 
     def add_event_labels(self, block: LabelBlock) -> None:
-        time, grid = self.manifest["time"], self.manifest["event_grid"]
         with output_errors(self._folder.target):
             if self._labels is None:
-                shape = grid["height"], grid["width"]
-                self._labels = LabelFileWriter(self._folder.path, shape, time["begin_us"], time["end_us"])
+                self._labels = LabelFileWriter(self._folder.path, *self._grid_and_time)
             self._labels.append(block)
 
     def set_event_objects(self, objects_at: Callable[[NDArray, NDArray, NDArray], NDArray[np.uint16]]) -> None:

@@ -61,7 +61,8 @@ def calibrate_aps(
         calibrate_pairs(folder, out, report, progress, overwrite)
         return Path(out)
     captures = read_captures(folder)
-    check_calibration(out, described_captures(captures))
+    about = described_captures(captures)
+    check_calibration(out, about)
     if report is not None:
         check_report(out, report, overwrite)
     stacks = captures.frames("aps_dark"), captures.frames("aps_lit")
@@ -73,13 +74,7 @@ def calibrate_aps(
     tile = captures.spec.tile_rows, captures.spec.tile_cols
     telegraph = find_telegraph(stacks[0], dark, used, tile, captures.spec.full_scale_dn)
     result, dark, lit = analyse(captures, dark, lit, used, telegraph)
-    write_section(
-        out,
-        "aps",
-        described_captures(captures),
-        content(captures, result, dark, lit),
-        maps(captures, result, lit, dark),
-    )
+    write_section(out, "aps", about, content(captures, result, dark, lit), maps(captures, result, lit, dark))
     if report is not None:
         write_report(out, report, overwrite)
     return Path(out)
