@@ -401,6 +401,14 @@ def test_rests_by_hand(last, uneven, noisy):
     assert [rest.ramps.drift for rest in leaking] == pytest.approx([0.5, -0.4])
 
 
+@pytest.mark.parametrize(("first", "kept"), [(65, 3), (66, 2)])
+def test_late_events_of_ramps_that_end_later_do_not_count(first, kept):
+    """In the first of three factors of two more than 2 · 20 · 30 + 3 √(20 · 66) = 1309 are not those of noise alone."""
+    for rest in rests.rests(tally_of((first, 30, 28)), 0.0, 1.25):
+        assert rest.late == pytest.approx(GROUPS * np.array([first, 30, 28])[-kept:])
+        assert rest.edges_s[0] == pytest.approx(rest.ramps.rest_s / 2**kept, rel=0.09) and rest.edges_s.size == kept + 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SIX)
 def test_intervals_hold_the_truth_of_six_sensors(name):
