@@ -15,6 +15,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from hesim_render.core.guard import printable
+from hesim_render.core.html import tick_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,6 +28,8 @@ _SVG, _XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 _PER_INCH = 72
 #: Height of a line of the legend, px.
 _LEGEND_LINE = 16
+#: Logarithmic axes of a smaller range have numbers between powers of ten.
+_FEW_DECADES, _ONE_DECADE = 100.0, 10.0
 #: What every figure looks like, whatever the user's own ``matplotlibrc`` says. Text stays text, is never read as
 #: mathematics (a name may hold a $), and identifiers follow from the content alone: the same data give the same bytes.
 _SETTINGS: dict[Any, Any] = {
@@ -77,6 +80,22 @@ def points(axes: "Axes", x: NDArray, y: NDArray, colour: str, label: str = "", s
     size : diameter, px.
     """
     axes.plot(x, y, linestyle="none", marker="o", markersize=size, color=colour, alpha=0.55, label=label)
+
+
+def logarithmic(axes: "Axes", *which: str) -> None:
+    """Logarithmic axes, with numbers between the powers of ten where there are few of those."""
+    from matplotlib.ticker import LogLocator
+
+    for name in which:
+        (axes.set_xscale if name == "x" else axes.set_yscale)("log")
+        axis = axes.xaxis if name == "x" else axes.yaxis
+        axis.set_major_formatter(tick_text)
+        low, high = axis.get_view_interval()
+        if high < _FEW_DECADES * low:
+            axis.set_minor_locator(LogLocator(subs=(2, 5) if high > _ONE_DECADE * low else (2, 3, 4, 5, 7)))
+            axis.set_minor_formatter(tick_text)
+        else:
+            axis.set_minor_formatter("")
 
 
 def legend_below(figure: "Figure", axes: "Axes", columns: int) -> None:

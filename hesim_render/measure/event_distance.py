@@ -70,13 +70,22 @@ def of_equal_time(first: EventStream, second: EventStream) -> tuple[EventStream,
 
     Of one law, the longer one has longer intervals, other hot pixels and less scatter.
     """
-    spans = [stream.span_us() for stream in (first, second)]
+    spans = [_long_span_us(stream) for stream in (first, second)]
     least_us = min(end_us - begin_us for begin_us, end_us in spans)
     one, other = (
         replace(stream, interval_us=(begin_us, begin_us + least_us))
         for stream, (begin_us, _) in zip((first, second), spans, strict=True)
     )
     return one, other
+
+
+def _long_span_us(stream: EventStream) -> tuple[int, int]:
+    """Begin and end of a stream; one that is too short is refused by its own name, before the other is cut to it."""
+    begin_us, end_us = stream.span_us()
+    if end_us + 1 - begin_us <= PARTS * (_LEAST_PART_US - 1):
+        problem = f"lasts {end_us - begin_us} µs; expected {_LEAST_PART_US * PARTS} µs at least"
+        raise SpecError(problem, file=stream.source)
+    return begin_us, end_us
 
 
 def event_statistics(stream: EventStream) -> EventStatistics:
@@ -89,11 +98,8 @@ def event_statistics(stream: EventStream) -> EventStatistics:
     SpecError
         If it has too few events, or lasts for less than 2 ms a part.
     """
-    begin_us, end_us = stream.span_us()
+    begin_us, end_us = _long_span_us(stream)
     part_us = -(-(end_us + 1 - begin_us) // PARTS)
-    if part_us < _LEAST_PART_US:
-        problem = f"lasts {end_us - begin_us} µs; expected {_LEAST_PART_US * PARTS} µs at least"
-        raise SpecError(problem, file=stream.source)
     rows, cols = stream.shape
     result: list[tuple[NDArray, ...]] = []
     # blocks of the file are cut at the ends of parts: only what belongs to the next part is held

@@ -146,6 +146,6 @@ FRAMES: dict[str, Definition] = {
                                "dark pairs and series"),
     "column_noise_dn": Definition("temporal column noise", "Noise that the pixels of a column share.",
                                   "σ of column means", "dark pairs and series"),
-    "defect_pixels": Definition("defect pixels", "Pixels unlike the others in the dark or in the light.",
+    "defect_pixels": Definition("defect pixels", "Share of pixels unlike the others in the dark or in the light.",
                                 "|x − x̄ around it| > 8 robust σ, or stuck at 0 or full scale", "dark and lit series"),
 }  # fmt: skip

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.calibrate.aps.pairs import light_of
-from hesim_render.core.drawing import COLOURS, points
+from hesim_render.core.drawing import COLOURS, logarithmic, points
 from hesim_render.core.html import tick_text
 from hesim_render.report.emva import FrameFigures
 from hesim_render.report.figures import POLARITIES, EventFigures
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 Draw = Callable[["Axes"], None]
 #: Colours of ON and OFF.
 _ON_OFF = (COLOURS[1], COLOURS[0])
-#: Axes of a smaller range have numbers between powers of ten.
-_FEW_DECADES, _ONE_DECADE = 100.0, 10.0
 #: Height of axes over that of their data, where a legend stands above these.
 _LEGEND_ROOM = 1.35
 #: Intervals are drawn up to here, µs.
@@ -50,22 +48,6 @@ def frame_drawings(figures: FrameFigures) -> list[Draw]:
         lambda axes: _linearity(axes, figures),
         lambda axes: _snr(axes, figures),
     ]
-
-
-def _logarithmic(axes: "Axes", *which: str) -> None:
-    """Logarithmic axes, with numbers between the powers of ten where there are few of those."""
-    from matplotlib.ticker import LogLocator
-
-    for name in which:
-        (axes.set_xscale if name == "x" else axes.set_yscale)("log")
-        axis = axes.xaxis if name == "x" else axes.yaxis
-        axis.set_major_formatter(tick_text)
-        low, high = axis.get_view_interval()
-        if high < _FEW_DECADES * low:
-            axis.set_minor_locator(LogLocator(subs=(2, 5) if high > _ONE_DECADE * low else (2, 3, 4, 5, 7)))
-            axis.set_minor_formatter(tick_text)
-        else:
-            axis.set_minor_formatter("")
 
 
 def _s_curves(axes: "Axes", figures: EventFigures) -> None:
@@ -107,7 +89,7 @@ def _latency(axes: "Axes", figures: EventFigures) -> None:
         lux = [one.lux for one in every]
         _bars(axes, lux, [one.latency for one in every], colour, f"latency {name}")
         _bars(axes, lux, [one.jitter for one in every], colour, f"jitter {name}", "--")
-    _logarithmic(axes, "x", "y")
+    logarithmic(axes, "x", "y")
     _legend(axes)
 
 
@@ -126,7 +108,7 @@ def _detected(axes: "Axes", figures: EventFigures) -> None:
                 one.lux, one.share, 1.96 * one.error, color=colour, marker="o", markersize=3.6, linewidth=1, label=name
             )
     axes.axhline(DETECTED, color=COLOURS[6], linewidth=0.8, linestyle="--")
-    _logarithmic(axes, "x")
+    logarithmic(axes, "x")
     _legend(axes)
 
 
@@ -139,7 +121,7 @@ def _background(axes: "Axes", figures: EventFigures) -> None:
         about = "" if celsius is None or len(stated) == 1 else f", {celsius:g} °C"
         for k, (name, colour) in enumerate(zip(POLARITIES, _ON_OFF, strict=True)):
             _bars(axes, [one.lux for one in every], [one.rates[k] for one in every], colour, name + about)
-    _logarithmic(axes, "x", "y")
+    logarithmic(axes, "x", "y")
     _legend(axes)
 
 
@@ -158,7 +140,7 @@ def _band(axes: "Axes", figures: EventFigures) -> None:
         axes.axhline(np.sqrt(2) * band.swing[there][0], color=COLOURS[6], linewidth=0.8, linestyle="--")
     if band.entry["value"] is not None:
         axes.axvline(band.entry["value"], color=COLOURS[6], linewidth=0.8, linestyle=":")
-    _logarithmic(axes, "x", "y")
+    logarithmic(axes, "x", "y")
 
 
 def _intervals(axes: "Axes", figures: EventFigures) -> None:
@@ -172,7 +154,7 @@ def _intervals(axes: "Axes", figures: EventFigures) -> None:
     dead = next(one.value for one in figures.entries if one.key == "dead_time")
     if dead["value"] is not None:
         axes.axvline(dead["value"], color=COLOURS[1], linewidth=1)
-    _logarithmic(axes, "x", "y")
+    logarithmic(axes, "x", "y")
 
 
 def _levels(figures: FrameFigures) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], str]:
@@ -214,5 +196,5 @@ def _snr(axes: "Axes", figures: FrameFigures) -> None:
     if efficiency is not None:
         line = np.geomspace(light[some].min(), light[some].max(), 60)
         axes.plot(line, np.sqrt(efficiency * line), color=COLOURS[6], linestyle="--", label="shot noise alone")
-    _logarithmic(axes, "x", "y")
+    logarithmic(axes, "x", "y")
     axes.legend(frameon=False)

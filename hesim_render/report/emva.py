@@ -10,6 +10,7 @@ from hesim_render.calibrate.aps.pairs import PairCalibration, evaluate
 from hesim_render.calibrate.aps.pairs_findings import findings
 from hesim_render.calibrate.aps.pairs_output import content
 from hesim_render.calibrate.estimate import estimated, not_identifiable
+from hesim_render.calibrate.recordings.still import share
 from hesim_render.recording.pair_set import read_pair_set
 from hesim_render.report.estimates import figure
 
@@ -71,9 +72,7 @@ def frame_figures(folder: str | Path) -> FrameFigures:
     )  # fmt: skip
     entries = {name: section[name] for name in names}
     entries |= _of_both(entries, result)
-    bad = int(section["bad_pixels"])
-    pixels = result.defects.size
-    entries["defect_pixels"] = {"value": float(bad), "unit": "", "note": f"of {pixels}"}
+    entries["defect_pixels"] = share(int(section["bad_pixels"]), result.defects.size)
     return FrameFigures(result, entries, [one.text for one in findings(result)])
 
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hesim_render.core.drawing import COLOURS, legend_below, new_figure, points, report_style, svg
-from hesim_render.core.html import filled, number, tick_text
+from hesim_render.core.drawing import COLOURS, legend_below, logarithmic, new_figure, points, report_style, svg
+from hesim_render.core.html import filled, number
 from hesim_render.twin.comparison import Check
 
 _SIZE_PX = (440, 340)
@@ -58,8 +58,6 @@ def _overlay(check: Check) -> str:
     lower.set_ylim(-reach, reach)
     both = np.concatenate([check.real, check.twin])
     if both.min() > 0 and both.max() > _LOG_FROM * both.min() and not check.place.startswith(("photons", "exposure")):
-        upper.set_yscale("log")
-        upper.yaxis.set_major_formatter(tick_text)
-        upper.yaxis.set_minor_formatter("")
+        logarithmic(upper, "y")
     legend_below(figure, upper, 2)
     return svg(figure)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hesim_render.calibrate.recordings import calibrate_recordings, calibration, still
+from hesim_render.calibrate.recordings import calibrate_recordings, calibration, short_intervals, still
 from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
 from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, tally
@@ -283,6 +283,45 @@ def test_a_density_that_falls_within_the_counts_at_its_edge_is_not_known(fall, i
         assert stray["value"] == pytest.approx(4.5, abs=0.02)
     else:
         assert "falls at once after its step at 5 µs" in found["reason"]
+
+
+def stepped(edge, **others):
+    """900 intervals in each µs from the edge on, and other numbers where they are given."""
+    counts = np.where(np.arange(LONG_US) < edge, 0.0, 900.0)
+    for place, count in others.items():
+        counts[int(place[1:])] = count
+    return dead_time([SimpleNamespace(intervals=counts)])
+
+
+def test_a_crowded_first_microsecond_bounds_a_late_sharp_step_and_hides_an_early_one():
+    """1300 intervals where the density has 900 (chance below 1e-9): a step at 16 µs or later is known to 2 µs, unless
+    the density begins to rise more than 2 µs before it. 960 are none too many.
+    """
+    for edge, others in ((16, {"_16": 1300.0}), (40, {"_40": 1300.0}), (40, {"_40": 1300.0, "_38": 108.0})):
+        told = stepped(edge, **others)
+        assert (told["value"], *told["interval_95"]) == pytest.approx((edge, edge - 2, edge + 2))
+    for edge, others in ((15, {"_15": 1300.0}), (40, {"_40": 1300.0, "_37": 108.0})):
+        assert "falls at once" in stepped(edge, **others)["reason"]
+    assert stepped(40, _40=960.0)["value"] == pytest.approx(39.5 - 60 / 900)
+    # the shortest dead time that shows
+    assert stepped(2)["value"] == pytest.approx(1.5) and "no step" in stepped(1)["reason"]
+
+
+def test_a_rise_over_more_than_two_microseconds_is_in_the_interval():
+    """A tenth is reached at 41 µs, nine tenths at 44: a µs more on either side; 43.08 whole µs are missing."""
+    told = stepped(46, _40=45.0, _41=90.0, _42=270.0, _43=540.0, _44=810.0, _45=873.0)
+    assert told["value"] == pytest.approx(42.58) and told["interval_95"] == pytest.approx([40, 45])
+    assert "10 % of what it is later at 41 µs and 90 % at 44 µs; 45 intervals" in told["note"]
+    low, high = stepped(46, _41=90.0, _42=270.0, _43=810.0, _44=900.0, _45=900.0)["interval_95"]
+    assert 41.5 < low < high < 43.5
+
+
+def test_strays_are_no_steps_of_the_clock():
+    """500 intervals in every tenth µs: 5 in another one are strays, 6 are not."""
+    for strays, clock_us in (({13: 5.0}, 10), ({13: 6.0}, 1), ({25: 6.0}, 5)):
+        counts = np.where(np.arange(LONG_US) % 10, 0.0, 500.0)
+        counts[list(strays)] = list(strays.values())
+        assert short_intervals._clock_us(counts) == clock_us
 
 
 def limited(rng, per_ms):

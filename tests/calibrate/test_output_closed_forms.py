@@ -233,8 +233,10 @@ def test_what_is_not_significant_has_a_limit():
     assert found["value"] == 0 and found["upper_limit"] == pytest.approx(np.sqrt(0.19 + Z * 0.05), rel=1e-6)
     assert pairs_output._shared(-0.19, 0.05, 0.0)["upper_limit"] == pytest.approx(np.sqrt(Z * 0.05), rel=1e-6)
     assert pairs_output._correlation(calibration())["upper_limit"] == pytest.approx(0.013 + Z * 0.02, rel=1e-6)
-    found = pairs_output._linearity(calibration())
+    found = pairs_output._linearity(calibration(clear=np.ones(4, bool)))
     assert (found["value"], found["largest"], found["levels"]) == (pytest.approx(1.4 / 3), 0.9, 3)
+    curve = 0.22 * (np.array([100, 900, 1500]) + 2) * 1.0021
+    assert f"by {100 * np.mean(np.abs([22, 190, 200] / curve - 1)):.2g} % about" in found["note"]
     rows = SimpleNamespace(rows=Shared(0.62, 0.05, 3.0, 1e-9))
     check(frames_output._row_noise(rows), np.sqrt(0.62), 0.05 / (2 * np.sqrt(0.62)), "DN", Z)
     rows = SimpleNamespace(rows=Shared(0.07, 0.05, 1.2, 0.02))

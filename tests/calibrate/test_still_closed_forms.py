@@ -103,6 +103,15 @@ def test_rates_spread_and_regularity_have_the_errors_of_leaving_groups_out():
     assert whole > 2 * error
     assert told["value"] == pytest.approx(np.sqrt(whole))
     assert told["standard_error"] == pytest.approx(error / (2 * np.sqrt(whole)))
+    # halves of which one is larger where the other is smaller: no spread, and a limit that chance may have, above 0
+    moved = rng.poisson(9, PIXELS) - 9
+    one.counts[1] = 70 + moved, 70 - moved
+    first, second = one.counts[1].astype(float)
+    parts = [relative(first[group != k], second[group != k]) for k in range(GROUPS)]
+    error = np.sqrt(19 / 20 * np.sum((np.array(parts) - np.mean(parts)) ** 2))
+    told = rate_spread(one, 1)
+    assert relative(first, second) < -2 * error and told["value"] == 0
+    assert told["upper_limit"] == pytest.approx(np.sqrt(2 * error))
     # even intervals: a gamma law of shape r has a local variation of 3/(2r + 1), and the squared deviation 1/r
     one.pairs, one.variation = np.full(PIXELS, 6), np.full(PIXELS, 6 * 3 / (2 * 2.5 + 1))
     for counts in (rng.poisson(rng.uniform(20, 80, PIXELS), (2, PIXELS)), np.where(np.arange(PIXELS) % 4, 4, 3)):

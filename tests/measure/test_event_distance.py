@@ -339,8 +339,13 @@ def test_bad_input_is_one_clear_error():
     few = made(np.arange(100) * 1000, rng.integers(0, PIXELS, 100), np.ones(100, int))
     with pytest.raises(SpecError, match=r"few: has 100 events in 0\.099 s; expected 2000"):
         event_statistics(EventStream.of(few, SHAPE, "few"))
+    short = EventStream.of(made(np.arange(100), few["x"], few["polarity"]), SHAPE, "short")
     with pytest.raises(SpecError, match="short: lasts 99 µs; expected 40000"):
-        event_statistics(EventStream.of(made(np.arange(100), few["x"], few["polarity"]), SHAPE, "short"))
+        event_statistics(short)
+    # the longer one, cut to the time of the other, is not what is too short
+    for pair in ((EventStream.of(few, SHAPE, "few"), short), (short, EventStream.of(few, SHAPE, "few"))):
+        with pytest.raises(SpecError, match="short: lasts 99 µs; expected 40000"):
+            of_equal_time(*pair)
 
 
 def test_sensors_of_other_sizes_are_compared_pixel_by_pixel():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from scipy import special
-from scipy.stats import norm
+from scipy.stats import binom, norm
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.report import drawings, emva, figures, latency, limits, modulated, pdf, run, s_curves, simulate, texts
@@ -127,6 +127,20 @@ def test_figures_of_emva_1288_that_follow_from_others():
     none = {"value": None, "reason": "why"}
     found = emva._of_both({**entries, "full_well_e": none, "quantum_efficiency": none}, None)
     assert [found[name]["reason"] for name in ("snr_max", "threshold_photons", "dynamic_range")] == ["why"] * 3
+
+
+def test_defects_are_a_share_of_the_pixels_with_its_interval(monkeypatch):
+    """7 of 1440 pixels: as many or more have a chance of 2.5 % at one end, as many or fewer at the other."""
+    section = {name: {"value": None, "reason": "none"} for name in FRAMES if name not in ("defect_pixels", "snr_max")}
+    result = SimpleNamespace(defects=np.zeros((48, 30), bool))
+    for name, outcome in (
+        ("read_pair_set", None), ("evaluate", result), ("content", {**section, "bad_pixels": 7}), ("findings", []),
+    ):  # fmt: skip
+        monkeypatch.setattr(emva, name, lambda _, outcome=outcome: outcome)
+    told = emva.frame_figures("captures").entries["defect_pixels"]
+    low, high = told["interval_95"]
+    assert told["value"] == 7 / 1440 and "7 of 1440" in told["note"]
+    assert (binom.sf(6, 1440, low), binom.cdf(7, 1440, high)) == pytest.approx((0.025, 0.025), rel=1e-6)
 
 
 def answers_at(lux, share, error):

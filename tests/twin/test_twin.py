@@ -466,6 +466,15 @@ def test_the_page_counts_the_statistics_that_pass():
     assert ", at 5 photons per pixel; rms" in page.check_line(checks[0])
 
 
+def test_a_logarithmic_axis_of_a_spectrum_has_numbers_that_can_be_read():
+    """A spectrum from 1.3e-5 to 2.1e-4 has one power of ten in it, and one number tells nothing."""
+    places = np.linspace(0.013, 0.49, 7)
+    values = np.array([2.1e-4, 1.7e-5, 1.5e-5, 1.4e-5, 1.3e-5, 1.4e-5, 1.35e-5])
+    check = comparison.Check("columns", "relative²", "periods per pixel", places, values, 1.02 * values, 0.1 * values)
+    drawn = page.page([check], [])
+    assert {">2e-5<", ">5e-5<", ">1e-4<", ">2e-4<"} <= set(re.findall(r">[1-9]e-[45]<", drawn))
+
+
 def test_bins_of_deviations_reach_seven_medians_evenly_and_the_largest_in_equal_ratios():
     image = np.concatenate([np.linspace(0, 12, 4001), np.geomspace(14, 3000, 4000)])
     middle = float(np.median(image))

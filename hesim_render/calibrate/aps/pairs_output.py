@@ -274,9 +274,11 @@ def _linearity(result: PairCalibration) -> dict[str, Any]:
     used, deviations = result.linearity
     if deviations.size < 3:
         return not_identifiable("fewer than three levels lie between 5 and 95 % of saturation")
+    light, signal = result.light[result.clear][used], result.signal[result.clear][used]
+    scatter = 100 * np.mean(np.abs(signal / result.curve.at(light) - 1))
     return {
         "value": float(np.mean(np.abs(deviations))), "unit": "%", "largest": float(np.abs(deviations).max()),
-        "levels": int(used.sum()),
+        "levels": int(used.sum()), "note": f"the levels scatter by {scatter:.2g} % about a smooth curve",
     }  # fmt: skip
 
 

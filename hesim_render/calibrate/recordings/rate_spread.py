@@ -56,7 +56,7 @@ def rate_spread(tally: EventTally, polarity: int) -> dict[str, Any]:
         alike = np.exp(-2 * np.pi**2 * max(whole, 0.0) * both)
         error = float(np.hypot(error, (0.1 + 2 * alike) * even))
     if whole <= 2 * error:
-        limit = float(np.sqrt(max(whole + 2 * error, 0.0)))
+        limit = float(np.sqrt(max(whole, 0.0) + 2 * error))
         return {"value": 0.0, "upper_limit": limit, "note": "the pixels scatter no more than counting makes them"}
     return estimated(np.sqrt(whole), error / (2 * np.sqrt(whole)), "relative std", GROUPS)
 

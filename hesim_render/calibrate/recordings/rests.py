@@ -36,6 +36,8 @@ _STRONG = 1.4
 _EARLY, _INTERVALS = 1 / 64, 4.0
 #: Part of the pixels whose rest may begin later than late events count.
 _LATEST = 0.05
+#: Late events in the first factor of two over those of the second, above which those of ramps are among them.
+_OF_RAMPS = 2.0
 #: A rest shorter than this part of the period is none.
 _LEAST_REST = 0.1
 #: Gaps above the median differ by this much at most, where all pixels see the same rests.
@@ -196,6 +198,10 @@ def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] 
         edges_s[:-1] = end_s - 2.0 ** (cuts[:-1] / STEPS_PER_OCTAVE) * S_PER_US
         below = np.concatenate([np.zeros((gaps.shape[0], 1)), np.cumsum(gaps, axis=1)], axis=1)[:, cuts]
         late: NDArray[np.float64] = -np.diff(below, axis=1)
+        # noise makes about as many in each factor of two: many more in the first one are of pixels that rest later
+        first, second = late.sum(axis=0)[:2] if edges_s.size > 2 else (0.0, 0.0)
+        if first > _OF_RAMPS * second + 3 * np.sqrt(first):
+            edges_s, late = edges_s[1:], late[:, 1:]
         each = late.sum(axis=1)
         scatter = each.var(ddof=1) / each.mean() if each.mean() > 1 else 1.0
         drift = leak_hz if k == 0 else -leak_hz / ratio

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
+from scipy.ndimage import uniform_filter
 
 from hesim_render.calibrate.estimate import Z_95, estimated, not_identifiable
 from hesim_render.calibrate.recordings.rests import overshoots, quantile_us, rests
@@ -190,16 +191,25 @@ def seen_alike(tally: EventTally) -> NDArray[np.bool_]:
     for own in gap_us if seen.any() else ():
         middle = np.median(own[seen])
         seen = seen & (np.abs(own - middle) <= max(_SAME_REST * middle, 2 * interval_us))
-    return _regular(count, seen)
+    return _regular(count, _regular(count, seen), tally.shape)
 
 
-def _regular(count: NDArray[np.float64], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels of `seen` whose counts [polarity, pixel] are no farther from their median than those above it allow."""
+def _regular(
+    count: NDArray[np.float64], seen: NDArray[np.bool_], shape: tuple[int, int] | None = None
+) -> NDArray[np.bool_]:
+    """Pixels of `seen` whose counts [polarity, pixel] are no farther from their median than those above it allow.
+
+    With the shape of the sensor, means of 3×3 pixels are compared in place of single ones: thresholds differ from pixel
+    to pixel, while those that see less of the target lie together.
+    """
     for _ in range(_CUTS if np.count_nonzero(seen) > 2 * GROUPS else 0):
         middle = np.median(count[:, seen], axis=1, keepdims=True)
         share = (count / np.maximum(middle, 1e-300)).mean(axis=0)
+        least = 1 / max(float(middle.min()), 1e-300)
+        if shape is not None:
+            share, least = uniform_filter(share.reshape(shape), 3, mode="nearest").ravel(), least / 9
         half, upper = np.quantile(share[seen], (0.5, 0.84))
-        seen = seen & (np.abs(share - half) <= _FAR * max(upper - half, 1 / max(float(middle.min()), 1e-300)))
+        seen = seen & (np.abs(share - half) <= _FAR * max(upper - half, least))
     return seen
 
 
