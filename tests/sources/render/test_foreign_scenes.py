@@ -31,6 +31,7 @@ from hesim_render.sources.render.scene.mitsuba_scene import _plugin_dict
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.scene import Scene
+from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.motion import TrackSpec
 
 COLS, ROWS = 16, 12
@@ -399,6 +400,34 @@ def test_objects_that_were_made_before_are_looked_into():
     scene = mitsuba_scene({**ROOM, "ball": still}, [{"object": still.id(), "keyframes": STEP}])
     with pytest.raises(SpecError, match="made before, so that it would keep its pose"):
         RenderedFlux(scene, mono(COLS, ROWS), 2)
+
+
+def turned(matrix):
+    """A transform [4, 4] by a matrix [3, 3], moved and turned about an axis without symmetry."""
+    whole = np.eye(4)
+    whole[:3, :3] = rotation_about((0.3, -0.8, 0.5), 37.0) @ matrix
+    whole[:3, 3] = 0.4, 0.2, 0.6
+    return whole.tolist()
+
+
+def test_spheres_and_cylinders_that_would_stay_round_are_refused():
+    """Mitsuba makes a ball of any sphere, whatever its transform, and says so in its log alone."""
+    along_x = {"p0": [-0.2, 0, 0], "p1": [0.7, 0, 0]}
+    egg, tilted = np.diag([0.3, 0.45, 0.3]), np.array([[0.3, 0.1, 0], [0, 0.3, 0], [0, 0, 0.3]])
+    for shape, matrix in (
+        ({"type": "sphere"}, egg), ({"type": "sphere"}, tilted), ({"type": "cylinder"}, egg),
+        ({"type": "cylinder"}, tilted), ({"type": "cylinder", **along_x}, np.diag([0.3, 0.3, 0.45])),
+    ):  # fmt: skip
+        text = refusal({**ROOM, "ball": {**shape, "to_world": turned(matrix), "bsdf": GREY}})
+        assert text.startswith(f"mitsuba.inline.ball: shape '{shape['type']}': its to_world scales it unevenly")
+    even = {
+        "mirrored": ({"type": "sphere"}, np.diag([-0.3, 0.3, 0.3])),
+        "long": ({"type": "cylinder", "radius": 0.7}, np.diag([0.3, 0.3, 0.45])),
+        "long_x": ({"type": "cylinder", **along_x}, egg @ np.diag([1.4, 1, 1.5])),
+        "rounded": ({"type": "sphere"}, np.diag([0.3, 0.30001, 0.3])),
+    }
+    shapes = {name: {**shape, "to_world": turned(matrix), "bsdf": GREY} for name, (shape, matrix) in even.items()}
+    build(mitsuba(), mitsuba_scene({**ROOM, **shapes}).spec)
 
 
 def test_emitters_and_shapes_that_are_not_rendered_are_refused_by_name():
