@@ -30,8 +30,10 @@ def render_lines(render: dict[str, Any] | None) -> list[str]:
     for name in ("events", "frames"):
         part = audit.get(name)
         if part is not None:
+            # a still scene is judged by values that serve frames and events alike, also where there are no frames
+            of = f", {name}" if render["error_noise"].get(name) is not None else ""
             lines.append(
-                f"audit, {name}: true deviation rms {_short(part['deviation_noise']['rms'])}; "
+                f"audit{of}: true deviation rms {_short(part['deviation_noise']['rms'])}; "
                 f"{_percent(part['off'])} of values are off by more than {audit['tolerance_noise']:g} times the noise "
                 f"(with 99 % confidence at most {_percent(part['off_at_most'])}){_events(part)}"
             )

@@ -33,6 +33,15 @@ def test_bounds_are_told_where_enough_was_seen():
     assert render_lines(None) == []
 
 
+def test_the_audit_of_a_still_scene_speaks_of_frames_only_where_there_are_some():
+    part = {"deviation_noise": {"rms": 0.31}, **SHARES}
+    audit = {"frames": part, "tolerance_noise": 1.5, "verdict": "met"}
+    one = {"rms": 0.29, "p95": 0.6, "p99": 0.8}
+    for frames, start in ((None, "audit: true deviation"), (one, "audit, frames: true deviation")):
+        *_, last = render_lines({"error_noise": {"events": one, "frames": frames}, "audit": audit})
+        assert last.startswith(start)
+
+
 def test_a_few_of_the_runs_that_miss_their_quality_are_named(monkeypatch):
     """As many as fit into a line, and whether there are more; the remedy is that of the worst one."""
     monkeypatch.setattr(quality, "_MOST_NAMED", 3)
