@@ -15,6 +15,7 @@ from mitsuba_specfilm import reference_flux
 from rendering import make_scene, mitsuba_scene, mono
 
 import hesim_render as hr
+from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.isp.develop import _illumination
 from hesim_render.mosaic.schedule import BLOCK_INTERVALS, CELL_US
@@ -460,6 +461,8 @@ def test_instances_take_the_exact_mode_and_look_like_what_they_copy(moving):
     copied, plain = (mitsuba_scene(shapes, motion) for shapes in instances())
     with pytest.raises(NeedsExactMode, match="shape 'shapegroup': its copies have no surface of their own"):
         default_flux(copied, sensor)
+    with pytest.raises(NeedsExactMode, match=r"needs the exact mode: give a number of rays \(--samples\) in place of"):
+        scene_renderer(copied, sensor, 3, quality=0.4)
     found, expected = exact_flux(copied, sensor, 64), exact_flux(plain, sensor, 64)
     if moving:  # the box in which its motion is followed is that of the copy, not of a unit cube
         corners = build(mitsuba(), copied.spec).groups["copy_0"][0].corners
