@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
@@ -255,4 +256,4 @@ def new(
         raise RangeError("--like", like, f"one of {', '.join(known)}{did_you_mean(like, known)}")
     with replacing(out) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
-    say(f"{out}: a sensor file; look at it with 'hesim-render info {out}'")
+    say(f"{out}: a sensor file; look at it with: hesim-render info {shlex.quote(str(out))}")
