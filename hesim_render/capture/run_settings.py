@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from numbers import Real
 from typing import TypedDict
+
+import numpy as np
 
 from hesim_render.core.errors import ConflictError, RangeError, did_you_mean
 from hesim_render.core.units import US_PER_S
@@ -67,7 +71,7 @@ class RunSettings:
     Raises
     ------
     RangeError
-        If duration, seed or kind of truth is out of range.
+        If duration, seed or kind of truth is out of range, or text stands for a number.
     ConflictError
         If `quality` comes with `exact` or `samples`.
     """
@@ -85,8 +89,16 @@ class RunSettings:
     audit: bool = True
 
     def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.generic):  # the manifest, and much else, takes numbers of Python alone
+                object.__setattr__(self, field.name, value.item())
+        for name in ("quality", "samples", "max_minutes", "truth_every_us"):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, Real):
+                raise RangeError(name, value, "a number")
         duration_us = whole_us(self.duration_s)
-        require_seed(self.seed)
+        object.__setattr__(self, "seed", checked_seed(self.seed))
         if self.quality is not None and (self.exact or self.samples is not None):
             other = "samples" if self.samples is not None else "exact"
             raise ConflictError(
@@ -124,9 +136,9 @@ def whole_us(duration_s: float) -> int:
     Raises
     ------
     RangeError
-        If it is not finite, or shorter than half of one.
+        If it is no number, not finite, or shorter than half of one.
     """
-    if not 0 < duration_s < float("inf"):
+    if not isinstance(duration_s, Real) or not 0 < duration_s < float("inf"):
         raise RangeError("duration_s", duration_s, "a time above 0, in seconds")
     duration_us = round(duration_s * US_PER_S)
     if duration_us < 1:
@@ -134,10 +146,21 @@ def whole_us(duration_s: float) -> int:
     return duration_us
 
 
-def require_seed(seed: int) -> None:
-    """Refuse a seed that the generator does not take."""
-    if not 0 <= seed < 2**64:
+def checked_seed(seed: int) -> int:
+    """A seed, also one of NumPy's integers, as an integer of Python.
+
+    Raises
+    ------
+    RangeError
+        If it is not whole, or not one that the generator takes.
+    """
+    try:
+        result = operator.index(seed)
+    except TypeError:
+        raise RangeError("seed", seed, "a whole number, 0 to 2^64 - 1") from None
+    if not 0 <= result < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
+    return result
 
 
 def noise_models(
@@ -159,8 +182,10 @@ def noise_models(
     Raises
     ------
     RangeError
-        For a name that is not a term.
+        For a name that is not a term, or a text in place of a list.
     """
+    if isinstance(without, str):
+        raise RangeError("without", without, f"a list of names: [{without!r}]")
     for name in without:
         if name not in terms:
             raise RangeError("noise term", name, f"one of {', '.join(terms)}{did_you_mean(name, terms)}")
