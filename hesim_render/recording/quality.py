@@ -84,7 +84,9 @@ def _events(part: dict[str, Any]) -> str:
         verdict = "none was missed and none was extra" if none else (
             f"{_percent(part['missed'])} are missed, {_percent(part['extra'])} extra"
         )  # fmt: skip
-        return f"; of {max(true or 0, result or 0):.0f} noise-free events that it saw {verdict} (too few for a bound)"
+        # units are drawn with repetition: in a small region it looks at the same event many times
+        times = max(true or 0, result or 0)
+        return f"; of noise-free events, which it saw {times:.0f} times, {verdict} (too few for a bound)"
     return (
         f"; of signal events {_percent(part['missed'])} missed (at most {_percent(part['missed_at_most'])}), "
         f"{_percent(part['extra'])} extra (at most {_percent(part['extra_at_most'])})"

@@ -63,8 +63,8 @@ def test_a_few_of_the_runs_that_miss_their_quality_are_named(monkeypatch):
 
 
 @pytest.mark.parametrize(("shares", "told"), [
-    ({"missed": 0.0, "extra": 0.0}, "of 7 noise-free events that it saw none was missed and none was extra (too few"),
-    ({"missed": 0.012, "extra": 0.0}, "of 7 noise-free events that it saw 1.2 % are missed, 0 % extra (too few"),
+    ({"missed": 0.0, "extra": 0.0}, "events, which it saw 7 times, none was missed and none was extra (too few"),
+    ({"missed": 0.012, "extra": 0.0}, "events, which it saw 7 times, 1.2 % are missed, 0 % extra (too few"),
     ({"missed": 0.0, "extra": 0.0, "extra_at_most": 0.04}, "none was missed"),  # one of both bounds is enough
 ])  # fmt: skip
 def test_a_bound_that_says_nothing_is_no_threat(shares, told):
