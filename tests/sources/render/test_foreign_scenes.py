@@ -431,6 +431,26 @@ def test_spheres_and_cylinders_that_would_stay_round_are_refused():
     build(mitsuba(), mitsuba_scene({**ROOM, **shapes}).spec)
 
 
+@pytest.mark.parametrize(("largest", "is_refused"), [(0.93, False), (1.4, True)])
+def test_a_picture_of_a_lamp_that_mitsuba_would_cut_is_refused(largest, is_refused, tmp_path):
+    """In spectral scenes a picture is at most 1. The picture is in the dictionary, or in a file."""
+    mi = mitsuba()
+    values = np.full((3, 4, 3), 0.2, np.float32)
+    values[2, 1, 1] = largest
+    mi.Bitmap(values).write(str(tmp_path / "lamp.exr"))
+    for picture in ({"bitmap": mi.Bitmap(values)}, {"filename": str(tmp_path / "lamp.exr")}):
+        shine = {**LAMP, "emitter": {"type": "area", "radiance": {"type": "bitmap", **picture}}}
+        scene = mitsuba_scene({**ROOM, "lamp": shine, "ball": {**BALL, "bsdf": {
+            "type": "diffuse", "reflectance": {"type": "bitmap", **picture}}}})  # fmt: skip
+        if is_refused:
+            with pytest.raises(
+                SpecError, match=r"lamp.*texture 'bitmap': the picture of a lamp has values up to 1\.4,"
+            ):
+                build(mi, scene.spec)
+        else:
+            build(mi, scene.spec)
+
+
 def test_emitters_and_shapes_that_are_not_rendered_are_refused_by_name():
     glow = {"type": "directionalarea", "radiance": even(1.0)}
     text = refusal({**ROOM, "lamp": {**LAMP, "emitter": glow}})

@@ -24,6 +24,8 @@ from hesim_render.sources.render.scene.plugin_tables import (
 
 #: Shapes that stay round whatever their transform, and the largest part by which it may differ from a scale.
 _ROUND, _UNEVEN = ("sphere", "cylinder"), 1e-3
+#: Largest value of a picture of light, but for rounding.
+_WHITE = 1.001
 _THROUGH_MEDIA = ("volpath", "volpathmis")
 #: Integrators whose path length can be set.
 _HAVE_DEPTH = ("path", *_THROUGH_MEDIA)
@@ -188,6 +190,8 @@ def _why_refused(used: Used) -> str | None:
         return None  # an object of a Mitsuba class that no table refuses
     if used.name in _ROUND and (why := _why_not_round(used.node.props)) is not None:
         return why
+    if used.name == "bitmap" and any(owner.type.name == "Emitter" for owner in used.owners):
+        return _why_too_bright(used.node.props)
     known = HONOURED.get(used.kind, ()) + OF_THE_SENSOR_FILE.get(used.kind, ())
     return None if used.name in known else _unknown(used.kind)
 
@@ -207,6 +211,22 @@ def _why_not_round(properties: Any) -> str | None:
     if np.abs(products - even).max() <= _UNEVEN * np.abs(products).max():
         return None
     return "its to_world scales it unevenly, and Mitsuba would leave it round; use a mesh, or an 'instance' of it"
+
+
+def _why_too_bright(properties: Any) -> str | None:
+    """Why Mitsuba would not shine as the picture of a lamp says: in spectral scenes it cuts pictures at 1, silently."""
+    import mitsuba as mi
+
+    picture = properties.get("bitmap", None) or properties.get("data", None)
+    if picture is None:
+        picture = mi.Bitmap(str(mi.file_resolver().resolve(properties["filename"])))  # type: ignore[operator]
+    values = np.array(picture)
+    if values.dtype.kind != "f" or not values.size or float(values.max()) <= _WHITE:
+        return None
+    return (
+        f"the picture of a lamp has values up to {values.max():.3g}, and Mitsuba cuts them at 1; scale the picture to "
+        "1, and the light with radiance_scale or a level"
+    )
 
 
 def _unknown(kind: str) -> str:
