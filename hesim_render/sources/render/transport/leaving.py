@@ -1,0 +1,52 @@
+"""Rays that leave surfaces: they begin a little off, so that rounding does not let them meet the surface again.
+
+Mitsuba takes 9e-5 of 1 m and of the largest coordinate together, as for scenes of about 1 m. In a scene of 1 mm that is
+a tenth of it: shadows would begin beside the objects that cast them. Smaller scenes have a gap of their own size here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hesim_render.core.device import dr
+from hesim_render.core.device_types import Interaction, MitsubaModule, MitsubaObject, Point3, Ray, Vector3
+
+#: Scenes of this size or more have Mitsuba's own gap, m.
+_LARGE_M = 1.0
+
+
+class Leaving:
+    """Begins of rays on the surfaces of a scene.
+
+    Parameters
+    ----------
+    mi : the mitsuba module.
+    scene : Mitsuba scene of all shapes at rest.
+    """
+
+    def __init__(self, mi: MitsubaModule, scene: MitsubaObject) -> None:
+        box = scene.bbox()
+        size_m = float(np.linalg.norm(np.array(box.max) - np.array(box.min))) if scene.shapes() else _LARGE_M
+        self.mi, self._is_own = mi, size_m < _LARGE_M
+        self._size = dr.opaque(mi.Float, min(size_m, _LARGE_M))
+
+    def along(self, point: Interaction, direction: Vector3) -> Ray:
+        """A ray from a point of a surface in a direction."""
+        ray = point.spawn_ray(direction)
+        if self._is_own:
+            ray.o = self._beside(point, direction)
+        return ray
+
+    def to(self, point: Interaction, place: Point3) -> Ray:
+        """A ray from a point of a surface that ends just before a place."""
+        ray = point.spawn_ray_to(place)
+        if self._is_own:
+            ray.o = self._beside(point, place - point.p)
+            way = place - ray.o
+            length = dr.norm(way)
+            ray.d, ray.maxt = way / length, length * (1 - self.mi.math.ShadowEpsilon)
+        return ray
+
+    def _beside(self, point: Interaction, direction: Vector3) -> Point3:
+        gap = (self._size + dr.max(abs(point.p))) * self.mi.math.RayEpsilon
+        return dr.fma(dr.mulsign(gap, dr.dot(point.n, direction)), point.n, point.p)
