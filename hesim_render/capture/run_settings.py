@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from numbers import Real
+from dataclasses import dataclass
 from typing import TypedDict
 
-import numpy as np
-
 from hesim_render.core.errors import ConflictError, RangeError, did_you_mean
+from hesim_render.core.plain import require_list, settle_numbers
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
 from hesim_render.pixels.evs.model import EVS_TERMS, EvsNoise
@@ -89,14 +87,7 @@ class RunSettings:
     audit: bool = True
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.generic):  # the manifest, and much else, takes numbers of Python alone
-                object.__setattr__(self, field.name, value.item())
-        for name in ("quality", "samples", "max_minutes", "truth_every_us"):
-            value = getattr(self, name)
-            if value is not None and not isinstance(value, Real):
-                raise RangeError(name, value, "a number")
+        settle_numbers(self, ("duration_s", "quality", "samples", "max_minutes", "truth_every_us"))
         duration_us = whole_us(self.duration_s)
         object.__setattr__(self, "seed", checked_seed(self.seed))
         if self.quality is not None and (self.exact or self.samples is not None):
@@ -136,9 +127,9 @@ def whole_us(duration_s: float) -> int:
     Raises
     ------
     RangeError
-        If it is no number, not finite, or shorter than half of one.
+        If it is not finite, or shorter than half of one.
     """
-    if not isinstance(duration_s, Real) or not 0 < duration_s < float("inf"):
+    if not 0 < duration_s < float("inf"):
         raise RangeError("duration_s", duration_s, "a time above 0, in seconds")
     duration_us = round(duration_s * US_PER_S)
     if duration_us < 1:
@@ -184,8 +175,7 @@ def noise_models(
     RangeError
         For a name that is not a term, or a text in place of a list.
     """
-    if isinstance(without, str):
-        raise RangeError("without", without, f"a list of names: [{without!r}]")
+    require_list("without", without)
     for name in without:
         if name not in terms:
             raise RangeError("noise term", name, f"one of {', '.join(terms)}{did_you_mean(name, terms)}")

@@ -144,7 +144,9 @@ def animation(recording: Recorded) -> list[Picture]:
     """Events over the latest frame, step by step through the recording."""
     if min(recording.event_shape) == 0:
         frames = recording.frames
-        chosen = np.unique(np.linspace(0, len(frames) - 1, _ANIMATION_STEPS).round().astype(int)) if frames else []
+        if not frames:
+            return []
+        chosen = np.unique(np.linspace(0, len(frames) - 1, _ANIMATION_STEPS).round().astype(int))
         return [colour_picture(frames[k].raw, recording.mosaic, _ANIMATION_WIDTH_PX) for k in chosen]
     begin_us, end_us = recording.manifest["time"]["begin_us"], recording.manifest["time"]["end_us"]
     edges = np.linspace(begin_us, end_us + 1, _ANIMATION_STEPS + 1).astype(int)

@@ -29,7 +29,7 @@ def test_numbers_of_numpy_are_numbers():
 @pytest.mark.parametrize(("given", "message"), [
     ({"seed": 3.5}, "seed is 3.5; expected a whole number"),
     ({"seed": "7"}, "seed is '7'; expected a whole number"),
-    ({"duration_s": "0.1"}, "duration_s is '0.1'; expected a time above 0"),
+    ({"duration_s": "0.1"}, "duration_s is '0.1'; expected a number"),
     ({"quality": "0.5"}, "quality is '0.5'; expected a number"),
     ({"samples": "64"}, "samples is '64'; expected a number"),
     ({"truth_every_us": "1000"}, "truth_every_us is '1000'; expected a number"),
@@ -51,5 +51,5 @@ def test_recordings_with_numbers_of_numpy_are_written(tmp_path):
     for recording in made:
         manifest = hr.Recording.load(recording.path).manifest
         assert manifest["seed"] == 3 and manifest["settings"]["clean"] is True
-    with pytest.raises(RangeError, match=r"without is 'evs.leak'; expected a list of names: \['evs.leak'\]"):
+    with pytest.raises(RangeError, match=r"without is 'evs.leak'; expected a list: \['evs.leak'\]"):
         noise_models(sensor, without="evs.leak")

@@ -8,9 +8,7 @@ COLS, ROWS, RAYS = 24, 16, 64
 
 
 def scene(scale, depth):
-    """A box and a moving ball that touch a floor, 1.3 m from corner to corner, times a scale; the plane of the lights'
-    level lies in it.
-    """
+    """A box and a moving ball that touch a floor, 1.2 m from corner to corner, times a scale, and a lamp far away."""
 
     def size(*values):
         return [value * scale for value in values]
@@ -24,7 +22,7 @@ def scene(scale, depth):
     plane = {"plane_point_m": [0, 0, 0], "plane_normal": [0, 1, 0]}
     light = [
         {"type": "directional", "direction": [-0.8, -1, 0.1], "illuminance_lux": 300, **plane},
-        {"type": "area", "position_m": size(0.3, 0.5, 0.2), "size_m": size(0.1, 0.06), "illuminance_lux": 200, **plane},
+        {"type": "area", "position_m": size(1.5, 2.5, 1.1), "size_m": size(0.5, 0.3), "illuminance_lux": 200, **plane},
         {"type": "uniform", "illuminance_lux": 150, **plane},
     ]
     track = [{"t_us": 0}, {"t_us": 1000, "translation_m": size(0.03, 0, 0.01)}]

@@ -21,12 +21,14 @@ class Leaving:
     Parameters
     ----------
     mi : the mitsuba module.
-    scene : Mitsuba scene of all shapes at rest.
+    scene : Mitsuba scene of all shapes at rest; lamps do not count for its size.
     """
 
     def __init__(self, mi: MitsubaModule, scene: MitsubaObject) -> None:
-        box = scene.bbox()
-        size_m = float(np.linalg.norm(np.array(box.max) - np.array(box.min))) if scene.shapes() else _LARGE_M
+        # lamps may be far away from what they light
+        boxes = [shape.bbox() for shape in scene.shapes() if not shape.is_emitter()]
+        ends = np.array([[box.min, box.max] for box in boxes], np.float64).reshape(-1, 2, 3)
+        size_m = float(np.linalg.norm(ends[:, 1].max(axis=0) - ends[:, 0].min(axis=0))) if boxes else _LARGE_M
         self.mi, self._is_own = mi, size_m < _LARGE_M
         self._size = dr.opaque(mi.Float, min(size_m, _LARGE_M))
 
