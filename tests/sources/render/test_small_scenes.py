@@ -1,9 +1,16 @@
 """Radiance does not depend on the scale of a scene: small ones are rendered as large ones."""
 
+import warnings
+
 import numpy as np
 import pytest
 from rendering import make_scene, mono, pair_tracer, traced
 
+from hesim_render.sources.render.scene.builder import build
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.transport.moving_scene import MovingScene
+
+CAMERA = {"origin_m": [0, 0, 3], "target_m": [0, 0, 0], "horizontal_fov_deg": 20}
 COLS, ROWS, RAYS = 24, 16, 64
 
 
@@ -41,3 +48,19 @@ def test_small_scenes_look_as_large_ones(depth):
     )
     np.testing.assert_allclose(small.mean() / large.mean(), 1, atol=3e-4)
     assert np.sqrt(np.mean((small / large - 1) ** 2)) < 0.004
+
+
+@pytest.mark.parametrize(("far_m", "is_told"), [(320, False), (450, True)])
+def test_a_scene_far_from_the_origin_is_told(far_m, is_told):
+    """At 450 m rays leave surfaces by 40 mm, a tenth of this scene."""
+    card = {"name": "card", "shape": "rectangle", "size_m": [0.3, 0.24, 0], "position_m": [0, far_m, 1]}
+    lamp = {"type": "area", "position_m": [0, 0, 2], "size_m": [1, 1], "illuminance_lux": 100}
+    built = build(mitsuba(), make_scene(objects=[{**card, "reflectance": 0.5}], light=lamp, camera=CAMERA).spec)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        MovingScene(built)
+    texts = [str(warning.message) for warning in caught]
+    assert len(texts) == is_told
+    assert all(
+        f"0.384 m large, lies {far_m} m from the origin" in text and "begin 0.04 m off" in text for text in texts
+    )

@@ -6,13 +6,18 @@ a tenth of it: shadows would begin beside the objects that cast them. Smaller sc
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Interaction, MitsubaModule, MitsubaObject, Point3, Ray, Vector3
+from hesim_render.core.errors import HesimWarning
 
 #: Scenes of this size or more have Mitsuba's own gap, m.
 _LARGE_M = 1.0
+#: Distance from the origin over the size of a scene beyond which the gap is no longer small, a tenth of the size.
+_FAR = 1000
 
 
 class Leaving:
@@ -29,6 +34,14 @@ class Leaving:
         boxes = [shape.bbox() for shape in scene.shapes() if not shape.is_emitter()]
         ends = np.array([[box.min, box.max] for box in boxes], np.float64).reshape(-1, 2, 3)
         size_m = float(np.linalg.norm(ends[:, 1].max(axis=0) - ends[:, 0].min(axis=0))) if boxes else _LARGE_M
+        far_m = float(np.abs(ends).max(initial=0.0))
+        if far_m > _FAR * size_m:
+            warnings.warn(
+                f"the scene, {size_m:.3g} m large, lies {far_m:.3g} m from the origin, too far for single precision: "
+                f"its shadows begin {far_m * mi.math.RayEpsilon:.2g} m off; move it and its camera to the origin",
+                HesimWarning,
+                stacklevel=2,
+            )
         self.mi, self._is_own = mi, size_m < _LARGE_M
         self._size = dr.opaque(mi.Float, min(size_m, _LARGE_M))
 
