@@ -222,7 +222,7 @@ def test_ranges_and_files(tmp_path, capsys):
     file.write_text(json.dumps({**BASE, "vary": {}, "seeds": [5], "keep": True, "options": {"samples": 512}}))
     with pytest.raises(SystemExit) as stop:
         cli.main(["study", str(file), "--out", str(tmp_path / "out")])
-    assert stop.value.code == 0 and "1 runs in" in capsys.readouterr().out
+    assert stop.value.code == 0 and "1 run in" in capsys.readouterr().out
     (kept,) = (tmp_path / "out" / "recordings").iterdir()
     assert hr.Recording.load(kept).manifest["seed"] == 5
 
