@@ -28,6 +28,8 @@ except PackageNotFoundError:  # run from a source tree that was never installed
 
 # Imported on first use: the command line must answer --help without loading a renderer.
 _HOMES = {
+    "HesimError": "hesim_render.core.errors",
+    "HesimWarning": "hesim_render.core.errors",
     "ImuModel": "hesim_render.sources.render.truth.imu",
     "Recording": "hesim_render.recording.recording",
     "Scene": "hesim_render.sources.scene",
@@ -47,6 +49,8 @@ _HOMES = {
 }
 
 __all__ = [
+    "HesimError",
+    "HesimWarning",
     "ImuModel",
     "Recording",
     "Scene",
@@ -72,6 +76,7 @@ if TYPE_CHECKING:
     from hesim_render.capture.simulate import simulate
     from hesim_render.capture.simulate_cube import simulate_cube
     from hesim_render.capture.simulate_video import simulate_video
+    from hesim_render.core.errors import HesimError, HesimWarning
     from hesim_render.recording.recording import Recording
     from hesim_render.sensor.photocurrent import photocurrent
     from hesim_render.sensor.sensor import Sensor, load_sensor

@@ -30,6 +30,14 @@ class UnfinishedError(HesimError):
     """Some clips could not be built; the others are there, and the same command builds the missing ones."""
 
 
+def require_workers(workers: int, span_s: float) -> None:
+    """Refuse a negative number of workers, or length of the spans that they share."""
+    if workers < 0:
+        raise RangeError("workers", workers, "0 or more")
+    if not 0 <= span_s < float("inf"):
+        raise RangeError("span_s", span_s, "a length of time, s; or 0 for whole clips")
+
+
 def build_benchmark(
     spec: BenchmarkSpec | str | Path,
     out: str | Path,
@@ -66,10 +74,7 @@ def build_benchmark(
     UnfinishedError
         If clips could not be built.
     """
-    if workers < 0:
-        raise RangeError("workers", workers, "0 or more")
-    if not 0 <= span_s < float("inf"):
-        raise RangeError("span_s", span_s, "a length of time, s; or 0 for whole clips")
+    require_workers(workers, span_s)
     spec = spec if isinstance(spec, BenchmarkSpec) else read_benchmark(spec)
     plan = BenchmarkPlan(spec)
     plan.check()

@@ -1,10 +1,12 @@
 """How a scene is simulated: the settings of a run, checked, and the sensor's noise with terms switched off by name."""
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypedDict
 
 from hesim_render.core.errors import ConflictError, RangeError, did_you_mean
+from hesim_render.core.plain import require_list, settle_numbers
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
 from hesim_render.pixels.evs.model import EVS_TERMS, EvsNoise
@@ -65,7 +67,7 @@ class RunSettings:
     Raises
     ------
     RangeError
-        If duration, seed or kind of truth is out of range.
+        If duration, seed or kind of truth is out of range, or text stands for a number.
     ConflictError
         If `quality` comes with `exact` or `samples`.
     """
@@ -83,8 +85,9 @@ class RunSettings:
     audit: bool = True
 
     def __post_init__(self) -> None:
+        settle_numbers(self, ("duration_s", "quality", "samples", "max_minutes", "truth_every_us"))
         duration_us = whole_us(self.duration_s)
-        require_seed(self.seed)
+        object.__setattr__(self, "seed", checked_seed(self.seed))
         if self.quality is not None and (self.exact or self.samples is not None):
             other = "samples" if self.samples is not None else "exact"
             raise ConflictError(
@@ -132,10 +135,21 @@ def whole_us(duration_s: float) -> int:
     return duration_us
 
 
-def require_seed(seed: int) -> None:
-    """Refuse a seed that the generator does not take."""
-    if not 0 <= seed < 2**64:
+def checked_seed(seed: int) -> int:
+    """A seed, also one of NumPy's integers, as an integer of Python.
+
+    Raises
+    ------
+    RangeError
+        If it is not whole, or not one that the generator takes.
+    """
+    try:
+        result = operator.index(seed)
+    except TypeError:
+        raise RangeError("seed", seed, "a whole number, 0 to 2^64 - 1") from None
+    if not 0 <= result < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
+    return result
 
 
 def noise_models(
@@ -157,8 +171,9 @@ def noise_models(
     Raises
     ------
     RangeError
-        For a name that is not a term.
+        For a name that is not a term, or a text in place of a list.
     """
+    require_list("without", without)
     for name in without:
         if name not in terms:
             raise RangeError("noise term", name, f"one of {', '.join(terms)}{did_you_mean(name, terms)}")

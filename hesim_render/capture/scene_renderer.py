@@ -46,7 +46,8 @@ def scene_renderer(
             )
         except NeedsExactMode as error:
             if quality is not None:
-                raise
+                text = f"{error}; such a scene needs the exact mode: give a number of rays (--samples) in place of"
+                raise NeedsExactMode(f"{text} a quality") from None
             because = str(error)
     rays = samples if samples is not None else MOVING_SAMPLES if scene.spec.moves else STATIC_SAMPLES
     return flickering(

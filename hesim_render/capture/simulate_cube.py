@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.run_settings import noise_models, require_seed, whole_us
+from hesim_render.capture.run_settings import checked_seed, noise_models, whole_us
 from hesim_render.core import backend
 from hesim_render.core.progress import Progress, shown
 from hesim_render.mosaic.description import describe
@@ -75,7 +75,7 @@ def simulate_cube(
         If `out` exists or cannot be written. No partial output is left.
     """
     sensor = as_sensor(sensor)
-    require_seed(seed)
+    seed, clean = checked_seed(seed), bool(clean)
     duration_us = whole_us(duration_s)
     require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
     chosen = CubeOptions.of(options)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.run_settings import noise_models, require_seed
+from hesim_render.capture.run_settings import checked_seed, noise_models
 from hesim_render.capture.scene_run import require_short
 from hesim_render.core import backend
 from hesim_render.core.errors import RangeError, SpecError
@@ -108,7 +108,7 @@ def simulate_video(
         output is left.
     """
     sensor = as_sensor(sensor)
-    require_seed(seed)
+    seed, clean = checked_seed(seed), bool(clean)
     backend.jit()
     aps, evs = noise_models(sensor, clean, without)
     flux = VideoFlux(source, sensor, VideoOptions.of(**options))

@@ -47,13 +47,14 @@ def build(
 
     Ends with status 3 where the audits find clips that are worse than the benchmark asks for.
     """
-    from hesim_render.benchmark.build import build_benchmark, check_build, last_run
+    from hesim_render.benchmark.build import build_benchmark, check_build, last_run, require_workers
     from hesim_render.recording.quality import is_short_of_wish, verdict_lines
     from hesim_render.specs.benchmark import read_benchmark
     from hesim_render.specs.files import parse_override
 
     if scheduler is not None and workers != 1:
         raise RangeError("--workers", workers, "nothing beside --scheduler, whose workers build the clips")
+    require_workers(workers, span)
     content = read_benchmark(spec, dict(map(parse_override, set_ or [])))
     console = Console(json_, quiet, dry_run)
     if dry_run:

@@ -10,6 +10,7 @@ from hesim_render.cli.options import SENSOR_HELP, HelpAll, Overwrite, Region, ch
 from hesim_render.cli.simulate import show_recording
 from hesim_render.cli.terminal import parse_size
 from hesim_render.core.errors import ConflictError
+from hesim_render.core.progress import counted
 
 
 def _complete_export(incomplete: str) -> list[str]:
@@ -69,12 +70,15 @@ def export(
     counts = loaded.manifest["counts"]
     if format in WHOLE_FORMATS:
         facts = {"format": format, "written": written, "events": counts["events"], "frames": counts["frames"]}
-        console.result(f"{format} of {counts['frames']} frames and {counts['events']} events in {written}", facts)
+        console.result(
+            f"{format} of {counted(counts['frames'], 'frame')} and {counted(counts['events'], 'event')} in {written}",
+            facts,
+        )
         return
     noun = "frame" if written.is_dir() else "event"
     count = counts[f"{noun}s"]
     facts = {"format": format, "written": written, f"{noun}s": count}
-    console.result(f"{count} {noun}{'' if count == 1 else 's'} in {written}", facts)
+    console.result(f"{counted(count, noun)} in {written}", facts)
 
 
 def import_(
@@ -133,7 +137,7 @@ def import_(
             count, on = count + block.size, on + int((block["polarity"] > 0).sum())
         rows, cols = stream.shape
         console.result(
-            f"{count} events ({on} ON, {count - on} OFF) of {cols}x{rows} px in {written}",
+            f"{counted(count, 'event')} ({on} ON, {count - on} OFF) of {cols}x{rows} px in {written}",
             {"written": written, "events": count, "events_on": on, "events_off": count - on,
              "event_grid": {"width": cols, "height": rows}},
         )  # fmt: skip

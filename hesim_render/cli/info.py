@@ -2,6 +2,7 @@
 
 import math
 import os
+import shlex
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
@@ -252,4 +253,4 @@ def new(
         known = (*_KINDS, *list_names("sensors"))
         raise RangeError("--like", like, f"one of {', '.join(known)}{did_you_mean(like, known)}")
     write_whole(out, text)
-    say(f"{out}: a sensor file; look at it with 'hesim-render info {out}'")
+    say(f"{out}: a sensor file; look at it with: hesim-render info {shlex.quote(str(out))}")

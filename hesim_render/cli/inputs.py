@@ -94,6 +94,11 @@ def input_kind(given: str, keys: Collection[str]) -> InputKind:
     return InputKind.video if end and end not in (".yaml", ".yml") else InputKind.scene
 
 
+def was_given(value: object) -> bool:
+    """Whether an option of the command line has a value of its own; 0 is one, although it equals False."""
+    return value is not None and value is not False and value != []
+
+
 def check_options(kind: InputKind, given: Mapping[str, Any]) -> None:
     """Refuse options that this kind of input does not take.
 
@@ -103,7 +108,7 @@ def check_options(kind: InputKind, given: Mapping[str, Any]) -> None:
     given : options of the command line and their values; what was not given is None, False or empty.
     """
     for name, value in given.items():
-        if value not in (None, False, []) and name not in _TAKEN[kind]:
+        if was_given(value) and name not in _TAKEN[kind]:
             able = [each.value for each, names in _TAKEN.items() if name in names]
             raise ConflictError(name, value, f"{name}: the input is {kind.value}; only {' or '.join(able)} takes this")
 

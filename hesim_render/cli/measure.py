@@ -80,8 +80,11 @@ def _region(roi: str) -> tuple[int, int, int, int]:
 
 
 def compare(
-    first: Annotated[Path, typer.Argument(metavar="RECORDING", help="event file, such as that of a real camera")],
-    second: Annotated[Path, typer.Argument(metavar="RECORDING", help="event file of a similar scene")],
+    first: Annotated[
+        Path,
+        typer.Argument(metavar="RECORDING", help="event file, such as that of a real camera, or folder of a recording"),
+    ],
+    second: Annotated[Path, typer.Argument(metavar="RECORDING", help="another of a similar scene")],
     size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of the sensor, if files do not state it")] = None,
     json_: Json = False,
     quiet: Quiet = False,

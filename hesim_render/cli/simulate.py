@@ -8,7 +8,7 @@ import typer
 
 from hesim_render.cli.console import Console, DryRun, Json, Quiet, recording_facts
 from hesim_render.cli.exit_status import ExitStatus
-from hesim_render.cli.inputs import InputKind, Inputs, check_options, input_kind, with_values
+from hesim_render.cli.inputs import InputKind, Inputs, check_options, input_kind, was_given, with_values
 from hesim_render.cli.options import (
     LONG_MINUTES,
     SENSOR_HELP,
@@ -170,7 +170,7 @@ def _tell_live_file(console: Console, out: Path) -> None:
 
 def _given(**options: Any) -> dict[str, Any]:
     """The options that were given, so that the others keep their defaults."""
-    return {name: value for name, value in options.items() if value not in (None, False, [])}
+    return {name: value for name, value in options.items() if was_given(value)}
 
 
 def show_recording(

@@ -10,6 +10,7 @@ from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.options import FileKeys, HelpAll, Overwrite, names_of
 from hesim_render.core.errors import ConflictError
 from hesim_render.core.output import check_target
+from hesim_render.core.progress import counted
 
 #: Columns of the summary on the terminal.
 _SHOWN = {
@@ -165,6 +166,9 @@ def _sweep(console: Console, spec: str, out: Path, keys: dict[str, Any]) -> None
     verdicts = table[VERDICT].tolist() if VERDICT in table.columns else []
     audits: dict[str, dict[str, object] | None] = {f"row {k + 1}": {"verdict": each} for k, each in enumerate(verdicts)}
     short = [name for name, audit in audits.items() if is_short_of_wish(audit)]
-    lines = [f"{len(table)} runs in {out / 'results.csv'}", *(f"  {line}" for line in verdict_lines(audits, "runs"))]
+    lines = [
+        f"{counted(len(table), 'run')} in {out / 'results.csv'}",
+        *(f"  {line}" for line in verdict_lines(audits, "runs")),
+    ]
     facts = {"results": out / "results.csv", "runs": len(table), "not_met": short}
     console.result("\n".join(lines), facts, ExitStatus.NOT_MET if short else ExitStatus.DONE)

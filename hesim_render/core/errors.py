@@ -32,11 +32,32 @@ def did_you_mean(given: str, known: Iterable[str]) -> str:
 
 
 class HesimError(Exception):
-    """Base of all errors with a message meant for the user."""
+    """Base of all errors with a message meant for the user.
+
+    Examples
+    --------
+    >>> import hesim_render as hr
+    >>> try:
+    ...     hr.load_sensor("eiger").crop(3, 4)
+    ... except hr.HesimError as error:
+    ...     print(error)
+    roi width_px is 3; expected a multiple of the tile's 4 pixels
+    """
 
 
 class HesimWarning(UserWarning):
-    """A warning about input that is probably a mistake, but may be intended."""
+    """A warning about input that is probably a mistake, but may be intended.
+
+    Examples
+    --------
+    Turn such warnings into errors in a script that nobody watches:
+
+    >>> import warnings
+    >>> import hesim_render as hr
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", hr.HesimWarning)
+    ...     sensor = hr.load_sensor("davis346")
+    """
 
 
 class SpecError(HesimError, ValueError):

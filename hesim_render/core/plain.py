@@ -5,8 +5,9 @@ Plain values, NumPy arrays and types of Dr.Jit arrays become bytes and come back
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
+from hesim_render.core.errors import RangeError
 
 #: Length of the JSON text that comes first; the data of the arrays follow it in order.
 _LENGTH = struct.Struct("<Q")
@@ -29,6 +31,34 @@ class PlainState:
 
     def __getstate__(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+
+
+def settle_numbers(record: Any, numbers: Sequence[str]) -> None:
+    """Make NumPy's numbers in the fields of a dataclass, also a frozen one, those of Python, which files take.
+
+    Parameters
+    ----------
+    record : the dataclass.
+    numbers : names of fields that hold a number or None.
+
+    Raises
+    ------
+    RangeError
+        If one of these holds something else.
+    """
+    for field in fields(record):
+        value = getattr(record, field.name)
+        if isinstance(value, np.generic):
+            value = value.item()
+            object.__setattr__(record, field.name, value)
+        if field.name in numbers and value is not None and not isinstance(value, Real):
+            raise RangeError(field.name, value, "a number")
+
+
+def require_list(name: str, value: object) -> None:
+    """Refuse a text in place of a list of texts, whose letters would be taken for these."""
+    if isinstance(value, str):
+        raise RangeError(name, value, f"a list: [{value!r}]")
 
 
 def as_plain(value: Any, digits: int = 17) -> Any:

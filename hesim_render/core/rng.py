@@ -94,6 +94,8 @@ def device_normal(seed: int, stream: Stream, index: np.ndarray) -> np.ndarray:
     """
     types = jit()
     flat = np.ascontiguousarray(index, dtype=np.uint32).ravel()
+    if flat.size == 0:  # Dr.Jit has no loop over nothing
+        return np.zeros(index.shape, np.float32)
     deviates = philox(seed, stream, types.UInt32(flat)).next_float32x4_normal()[0]
     return np.array(deviates, dtype=np.float32).reshape(index.shape)
 

@@ -8,6 +8,7 @@ import numpy as np
 from hesim_render.core.drawing import new_figure, report_style
 from hesim_render.core.html import tick_text
 from hesim_render.core.output import replacing
+from hesim_render.core.progress import counted
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.schedule import exposures
 from hesim_render.sensor.sensor import Sensor
@@ -156,7 +157,7 @@ def motion_lines(figures: dict[str, float | None], sensor: Sensor, duration_us: 
         if most is not None:
             text += f" (the read-out takes {_rate(most)}{': EVENTS WILL BE LOST' if busy > most else ''})"
         lines.append(f"{text}; without noise, shadows and highlights")
-    of = [] if figures["frames"] is None else [f"{figures['frames']:g} frames"]
+    of = [] if figures["frames"] is None else [counted(round(figures["frames"]), "frame")]
     of += [] if figures["events"] is None else [f"{_rounded(figures['events'])} events"]
     lines.append(
         f"a recording of {length} has about {_rounded((figures['bytes'] or 0.0) / 1e6)} MB: {' and '.join(of)}"

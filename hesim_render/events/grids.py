@@ -38,10 +38,13 @@ def checked(events: NDArray, shape: tuple[int, int]) -> NDArray[np.intp]:
     Raises
     ------
     RangeError
-        If the array lacks a field of `EVENT_DTYPE`, or an event is outside the grid.
+        If the array lacks a field of `EVENT_DTYPE`, or an event is outside the grid or between its pixels.
     """
     check_form(events, shape)
     rows, cols = shape
+    for name in ("y", "x"):
+        if events.size and (events[name].dtype.kind not in "ui" or int(events[name].min()) < 0):
+            raise RangeError(f"events[{name!r}]", events[name].min(), "whole numbers, 0 or more")
     if events.size and (int(events["y"].max()) >= rows or int(events["x"].max()) >= cols):
         raise RangeError(
             "shape", shape, f"at least {int(events['y'].max()) + 1} rows and {int(events['x'].max()) + 1} columns, "

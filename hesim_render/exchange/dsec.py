@@ -30,8 +30,8 @@ LONGEST_US = 2**32 - 1
 
 def read_events(
     path: Path,
-    begin_us: int | None = None,
-    end_us: int | None = None,
+    begin_us: float | None = None,
+    end_us: float | None = None,
     *,
     shape: tuple[int, int] | None = None,
     count: int | None = None,
@@ -59,8 +59,8 @@ def read_events(
 
 def read_numbered_events(
     path: Path,
-    begin_us: int | None = None,
-    end_us: int | None = None,
+    begin_us: float | None = None,
+    end_us: float | None = None,
     *,
     shape: tuple[int, int] | None = None,
     count: int | None = None,
@@ -190,20 +190,20 @@ def _index(file: Any, total: int, path: Path) -> NDArray[np.int64]:
 
 
 def _range(
-    index: NDArray[np.int64], offset: int, count: int, begin_us: int | None, end_us: int | None
+    index: NDArray[np.int64], offset: int, count: int, begin_us: float | None, end_us: float | None
 ) -> tuple[int, int]:
     """Indices of the events in the wanted whole milliseconds."""
     last_ms = index.size - 1
     first, last = 0, count
     if begin_us is not None:
-        first = int(index[min(max(0, (begin_us - offset) // 1000), last_ms)])
-    if end_us is not None and (end_us - offset) // 1000 + 1 <= last_ms:
-        last = int(index[max(0, (end_us - offset) // 1000 + 1)])
+        first = int(index[int(min(max(0, begin_us - offset), 1000 * last_ms) // 1000)])
+    if end_us is not None and end_us - offset < 1000 * last_ms:
+        last = int(index[int(max(-1000, end_us - offset) // 1000 + 1)])
     return first, last
 
 
 def _check_index(
-    times: Any, first: int, last: int, offset: int, begin_us: int | None, end_us: int | None, path: Path
+    times: Any, first: int, last: int, offset: int, begin_us: float | None, end_us: float | None, path: Path
 ) -> None:
     """Check that the events just outside the indexed range lie outside the wanted time."""
     early = begin_us is not None and first > 0 and int(times[first - 1]) + offset >= begin_us

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.core.guard import printable, reading
+from hesim_render.core.guard import inside, printable, reading
 from hesim_render.exchange import (
     aedat4,
     dat,
@@ -121,7 +121,8 @@ def open_events(
     Parameters
     ----------
     path : the file: EVT2 or EVT3 RAW, DAT, AEDAT4, HDF5 in the layout of DSEC or of Prophesee, ``.npz`` with t, x, y
-        and p, MCAP with messages of type EventArray or EventPacket, or text with a line t x y p for each event.
+        and p, MCAP with messages of type EventArray or EventPacket, or text with a line t x y p for each event; or the
+        folder of a recording, whose ``events.h5`` is read.
     format : ``evt2``, ``evt3``, ``dat``, ``prophesee``, ``aedat4``, ``dsec``, ``npz``, ``mcap`` or ``txt``; default:
         what the begin of the file says.
     shape : rows and columns of the event grid, px; needed if the file does not state them.
@@ -139,6 +140,8 @@ def open_events(
         If the file is not of the format, is damaged, or has no size and `shape` is not given.
     """
     file = Path(path).expanduser()
+    if file.is_dir():
+        file = inside(file, "events.h5")
     if format is not None and format not in READABLE:
         raise RangeError("format", format, f"one of {', '.join(READABLE)}")
     result = _detect(file)

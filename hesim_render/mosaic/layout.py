@@ -1,5 +1,6 @@
 """Positions of pixels: the tile over the read-out region, its filters, roles and event grid."""
 
+import operator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -51,25 +52,29 @@ class Layout(PlainState):
         Raises
         ------
         RangeError
-            If the region is not made of whole tiles or does not fit.
+            If the region is not made of whole tiles or does not fit, or a size is not a whole number.
         """
         tile_rows, tile_cols = self.tile_shape
-        starts = []
+        starts, sizes = list[int](), list[int]()
         for name, size, whole, start, period in (
             ("width_px", width_px, self.cols, x, tile_cols),
             ("height_px", height_px, self.rows, y, tile_rows),
         ):
+            size = _whole(f"roi {name}", size)
             if size <= 0 or size > whole:
                 raise RangeError(f"roi {name}", size, f"1 to {whole}, the sensor's size")
             if size % period:
                 raise RangeError(f"roi {name}", size, f"a multiple of the tile's {period} pixels")
-            offset = ((whole - size) // 2) // period * period if start is None else start
+            offset = ((whole - size) // 2) // period * period
+            if start is not None:
+                offset = _whole(f"roi offset along {name}", start)
             if offset % period:
                 raise RangeError(f"roi offset along {name}", offset, f"a multiple of the tile's {period} pixels")
             if offset < 0 or offset + size > whole:
                 raise RangeError(f"roi offset along {name}", offset, f"0 to {whole - size}, inside the sensor")
             starts.append(offset)
-        return replace(self, row0=self.row0 + starts[1], col0=self.col0 + starts[0], rows=height_px, cols=width_px)
+            sizes.append(size)
+        return replace(self, row0=self.row0 + starts[1], col0=self.col0 + starts[0], rows=sizes[1], cols=sizes[0])
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -153,3 +158,11 @@ class Layout(PlainState):
             pixel[a :: grid.rows_per_tile, b :: grid.cols_per_tile] = index
             position[a :: grid.rows_per_tile, b :: grid.cols_per_tile] = k
         return pixel, position
+
+
+def _whole(name: str, value: int) -> int:
+    """A number of pixels, also one of NumPy's integers, as an integer of Python, which a manifest takes."""
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise RangeError(name, value, "a whole number of pixels") from None

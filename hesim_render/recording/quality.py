@@ -28,8 +28,10 @@ def render_lines(render: dict[str, Any] | None) -> list[str]:
     for name in ("events", "frames"):
         part = audit.get(name)
         if part is not None:
+            # a still scene is judged by values that serve frames and events alike, also where there are no frames
+            of = f", {name}" if render["error_noise"].get(name) is not None else ""
             lines.append(
-                f"audit, {name}: true deviation rms {_short(part['deviation_noise']['rms'])}; "
+                f"audit{of}: true deviation rms {_short(part['deviation_noise']['rms'])}; "
                 f"{_percent(part['off'])} of values are off by more than {audit['tolerance_noise']:g} times the noise "
                 f"(with 99 % confidence at most {_percent(part['off_at_most'])}){_events(part)}"
             )
@@ -80,7 +82,9 @@ def _events(part: dict[str, Any]) -> str:
         verdict = "none was missed and none was extra" if none else (
             f"{_percent(part['missed'])} are missed, {_percent(part['extra'])} extra"
         )  # fmt: skip
-        return f"; of {max(true or 0, result or 0):.0f} noise-free events that it saw {verdict} (too few for a bound)"
+        # units are drawn with repetition: in a small region it looks at the same event many times
+        times = max(true or 0, result or 0)
+        return f"; of noise-free events, which it saw {times:.0f} times, {verdict} (too few for a bound)"
     return (
         f"; of signal events {_percent(part['missed'])} missed (at most {_percent(part['missed_at_most'])}), "
         f"{_percent(part['extra'])} extra (at most {_percent(part['extra_at_most'])})"

@@ -61,12 +61,12 @@ class Recorded:
             self._events = no_events() if self.path is None else self._read_events(None, None)
         return self._events
 
-    def _read_events(self, begin_us: int | None, end_us: int | None) -> NDArray:
+    def _read_events(self, begin_us: float | None, end_us: float | None) -> NDArray:
         assert self.path is not None
         count = self.manifest["counts"]["events"]
         return read_events(inside(self.path, "events.h5"), begin_us, end_us, shape=self.event_shape, count=count)
 
-    def event_slice(self, begin_us: int, end_us: int) -> NDArray:
+    def event_slice(self, begin_us: float, end_us: float) -> NDArray:
         """Events of a time interval; from disk, only the events of that interval are read.
 
         Parameters
@@ -131,7 +131,7 @@ class Recorded:
         events = self.events
         return self.truth.objects_at(events["t_us"], events["x"], events["y"])
 
-    def labelled_slice(self, begin_us: int, end_us: int) -> NDArray:
+    def labelled_slice(self, begin_us: float, end_us: float) -> NDArray:
         """Events of a time interval with their causes and objects; from disk, only those of the interval are read.
 
         Parameters

@@ -141,8 +141,11 @@ def _mosaic_panels(frame: Frame, recording: Recorded, colour: Picture, width_px:
 def animation(recording: Recorded) -> list[Picture]:
     """Events over the latest frame, step by step through the recording."""
     if min(recording.event_shape) == 0:
-        frames = [colour_picture(f.raw, recording.mosaic, _ANIMATION_WIDTH_PX) for f in recording.frames]
-        return frames[:_ANIMATION_STEPS]
+        frames = recording.frames
+        if not frames:
+            return []
+        chosen = np.unique(np.linspace(0, len(frames) - 1, _ANIMATION_STEPS).round().astype(int))
+        return [colour_picture(frames[k].raw, recording.mosaic, _ANIMATION_WIDTH_PX) for k in chosen]
     begin_us, end_us = recording.manifest["time"]["begin_us"], recording.manifest["time"]["end_us"]
     edges = np.linspace(begin_us, end_us + 1, _ANIMATION_STEPS + 1).astype(int)
     shown_at = [entry["t_us"] for entry in recording.manifest["frames"]]

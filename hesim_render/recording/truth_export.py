@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hesim_render.core.errors import RangeError, did_you_mean
+from hesim_render.core.errors import RangeError, SpecError, did_you_mean
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.box_export import write_coco, write_dsec_det, write_prophesee_boxes
@@ -170,7 +170,16 @@ def tum_lines(t_us: NDArray[np.float64], poses: NDArray[np.float64]) -> list[str
     ----------
     t_us : [n], µs.
     poses : [n, 4, 4], to world.
+
+    Raises
+    ------
+    SpecError
+        If a pose mirrors, as that of a Mitsuba camera may.
     """
+    if np.any(np.linalg.det(poses[:, :3, :3]) <= 0):
+        raise SpecError(
+            "the camera's to_world mirrors its picture, which no quaternion says; the other formats have it"
+        )
     quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     rows = np.concatenate([poses[:, :3, 3], quaternion], axis=1)
     return [

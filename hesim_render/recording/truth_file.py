@@ -228,8 +228,8 @@ def _write_series(file: Any, truth: SceneTruth, request: TruthRequest) -> None:
         levels = truth.light_levels(times)
         file["light/time_us"] = times
         file["light/level"] = np.array([light.level for light in levels]).reshape(len(levels), times.size).T
-        file["light/names"] = np.array([light.name.encode() for light in levels], dtype="S64")
-        file["light/units"] = np.array([light.unit.encode() for light in levels], dtype="S16")
+        file["light/names"] = np.array([light.name.encode() for light in levels], dtype="S")
+        file["light/units"] = np.array([light.unit.encode() for light in levels], dtype="S")
         file["light/mean"] = np.array([light.mean for light in levels])
     if "imu" in request.kinds:
         from hesim_render.sources.render.truth.imu import ImuModel

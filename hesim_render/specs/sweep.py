@@ -1,5 +1,6 @@
 """The file of a sweep: keys that vary, seeds, and what is tabulated of every run."""
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
@@ -19,12 +20,13 @@ METRICS = (
 
 
 class RangeSpec(Strict):
-    """Evenly spaced values, on a linear or logarithmic scale."""
+    """Evenly spaced values, on a linear or logarithmic scale; `whole` numbers where the key takes no others."""
 
     first: float
     last: float
     count: int = Field(ge=2, le=10_000)
     scale: Literal["linear", "log"] = "linear"
+    whole: bool = Field(False, description="rounded to whole numbers, each once")
 
     @model_validator(mode="after")
     def _check(self) -> "RangeSpec":
@@ -32,12 +34,15 @@ class RangeSpec(Strict):
             raise ValueError("a logarithmic range needs ends above 0")
         return self
 
-    def values(self) -> list[float]:
+    def values(self) -> Sequence[float]:
         """The values, both ends included."""
         import numpy as np
 
         space = np.geomspace if self.scale == "log" else np.linspace
-        return [float(f"{value:.12g}") for value in space(self.first, self.last, self.count)]
+        values = space(self.first, self.last, self.count)
+        if self.whole:
+            return list(dict.fromkeys(int(value) for value in np.rint(values)))
+        return [float(f"{value:.12g}") for value in values]
 
 
 class SweepSpec(TaskFile):

@@ -3,7 +3,9 @@
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,8 +19,8 @@ from hesim_render.core.region import parse_roi
 from hesim_render.core.yaml_file import read_yaml
 from hesim_render.isp.pipeline import DEFAULT, Pipeline, load_pipeline
 from hesim_render.recording.recording import Recording
-from hesim_render.sensor.sensor import load_sensor
-from hesim_render.sources.scene import load_scene
+from hesim_render.sensor.sensor import Sensor, load_sensor
+from hesim_render.sources.scene import Scene, load_scene
 from hesim_render.specs.files import content_hash, locate, read_spec, validate
 from hesim_render.specs.filter_set import read_filter_set, read_palette
 from hesim_render.specs.study import StudySpec
@@ -115,10 +117,10 @@ def sweep(
     read = read_spec(SweepSpec, spec, "studies")
     folder = check_target(out, MARKER, overwrite=True)
     runs = list(runs_of(read))
+    made = _made(read, folder, runs)
     with output_errors(folder):
         (folder / "runs").mkdir(parents=True, exist_ok=True)
         write_whole(folder / MARKER, json.dumps(json.loads(read.model_dump_json()), indent=1) + "\n")
-    made = _made(read, folder)
     # runs that differ in the ISP alone come one after the other, so that they share a recording
     first = {run.simulation: k for k, run in reversed(list(enumerate(runs)))}
     order = sorted(range(len(runs)), key=lambda k: (first[runs[k].simulation], k))
@@ -143,12 +145,34 @@ def check_sweep(spec: str | Path | Mapping[str, Any] | SweepSpec, out: str | Pat
     """
     read = read_spec(SweepSpec, spec, "studies")
     folder, runs = check_target(out, MARKER, overwrite=True), list(runs_of(read))
-    made = _made(read, folder)
+    made = _made(read, folder, runs)
     return len(runs), sum(not _file_of(folder, made, run).is_file() for run in runs)
 
 
-def _made(spec: SweepSpec, folder: Path) -> "_Studies | _Recordings":
-    return _Recordings(spec, folder) if spec.study is None else _Studies(spec)
+def _made(spec: SweepSpec, folder: Path, runs: Sequence["Run"]) -> "_Studies | _Recordings":
+    """What makes the runs, each of whose values was taken once: a mistake in the last ends no sweep half-way."""
+    made = _Recordings(spec, folder) if spec.study is None else _Studies(spec)
+    seen = set[str]()
+    for run in runs:
+        values = {json.dumps(value) for value in (("", run.scene, run.sensor), *run.changes)}
+        if not values <= seen:
+            seen |= values
+            with _named(run), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the run itself repeats them
+                made.check(run)
+    return made
+
+
+@contextmanager
+def _named(run: Run) -> Iterator[None]:
+    """Name the run in the error of its files or keys."""
+    try:
+        yield
+    except OutputError:
+        raise
+    except HesimError as error:
+        combination = ", ".join(f"{key}={value}" for key, value in run.cells.items())
+        raise SpecError(f"run with {combination}: {str(error).splitlines()[0]}") from None
 
 
 def _file_of(folder: Path, made: "_Studies | _Recordings", run: Run) -> Path:
@@ -157,8 +181,7 @@ def _file_of(folder: Path, made: "_Studies | _Recordings", run: Run) -> Path:
 
 def _rows(made: "_Studies | _Recordings", run: Run, folder: Path) -> list[dict[str, Cell]]:
     """Rows of a run, from its file if there is one."""
-    combination = ", ".join(f"{key}={value}" for key, value in run.cells.items())
-    try:
+    with _named(run):
         file = _file_of(folder, made, run)
         if file.is_file():
             try:
@@ -168,10 +191,6 @@ def _rows(made: "_Studies | _Recordings", run: Run, folder: Path) -> list[dict[s
             except (ValueError, KeyError, TypeError):
                 raise OutputError(f"{file}: is damaged; remove it to repeat the run") from None
         rows = made.rows(run)
-    except OutputError:
-        raise
-    except HesimError as error:
-        raise SpecError(f"run with {combination}: {str(error).splitlines()[0]}") from None
     write_whole(file, json.dumps({"run": run.cells, "rows": rows}) + "\n")
     return rows
 
@@ -210,15 +229,19 @@ class _Recordings:
     def _developed(self, run: Run) -> Pipeline:
         return changed_pipeline(self._pipeline, run.keys(_ISP))
 
+    def check(self, run: Run) -> tuple[Scene, Sensor]:
+        """Scene and sensor of a run, whose keys, those of the ISP too, are right."""
+        self._developed(run)
+        sensor = load_sensor(self._spec.beside(run.sensor), run.keys(_SENSOR))
+        if self._spec.roi is not None:
+            sensor = sensor.crop(*parse_roi(self._spec.roi, "roi"))
+        return load_scene(self._spec.beside(run.scene), run.keys("")), sensor
+
     def _recording(self, run: Run) -> Recording:
         if self._last is not None and self._last[0] == run.simulation:
             return self._last[1]
-        self._developed(run)  # a mistake there is reported before a long simulation
+        scene, sensor = self.check(run)
         spec = self._spec
-        sensor = load_sensor(spec.beside(run.sensor), run.keys(_SENSOR))
-        if spec.roi is not None:
-            sensor = sensor.crop(*parse_roi(spec.roi, "roi"))
-        scene = load_scene(spec.beside(run.scene), run.keys(""))
         place = self._folder / "recordings" / _digest(run.simulation)
         recording = simulate(
             scene, sensor, duration_s=spec.duration_s, seed=run.seed, out=place if spec.keep else None,
@@ -236,7 +259,7 @@ class _Studies:
         self._spec = spec
         self._file = locate(spec.beside(spec.study), "studies")
 
-    def _study(self, run: Run) -> StudySpec:
+    def check(self, run: Run) -> StudySpec:
         """The study with the keys of a run; those that begin with sensor. change its sensors."""
         keys = run.keys("")
         if run.keys(_ISP):
@@ -250,7 +273,7 @@ class _Studies:
 
     def identity(self, run: Run) -> Any:
         """All that decides the figures of a run: the content of its files, too."""
-        read = self._study(run)
+        read = self.check(run)
         sets = [read_filter_set(use.beside(use.set)) for use in read.filter_sets]
         palettes = {use.palette or read.palette: use for use in read.filter_sets}
         files = [read_palette(use.beside(name)) for name, use in palettes.items()]
@@ -268,7 +291,7 @@ class _Studies:
 
     def rows(self, run: Run) -> list[dict[str, Cell]]:
         """A row for each combination of the study."""
-        table = study(self._study(run), progress=False)
+        table = study(self.check(run), progress=False)
         wanted = self._spec.metrics
         for name in wanted:
             if name not in table.columns:

@@ -66,6 +66,9 @@ def test_mistakes_are_one_line(spec, tmp_path, capsys, monkeypatch):
     assert "--scheduler" in text
     text = fails(capsys, "benchmark", "build", spec, "--out", out, "--scheduler", "x", "--workers", 3)
     assert "--workers" in text
+    for option in ("--workers", "--span"):  # by a dry run as well
+        text = fails(capsys, "benchmark", "build", spec, "--out", out, "--dry-run", option, -1)
+        assert f"{option} is -1" in text
     assert "no benchmark" in fails(capsys, "benchmark", "verify", tmp_path)
     assert "split" in fails(capsys, "benchmark", "evaluate", tmp_path, "--split", "tets")
 

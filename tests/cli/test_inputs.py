@@ -56,9 +56,19 @@ def test_the_ends_of_cubes_are_those_that_can_be_read():
     (InputKind.recording, "--seed"), (InputKind.recording, "--set"), (InputKind.scene, "--scene"),
 ])  # fmt: skip
 def test_an_option_of_another_kind_is_refused(kind, option):
-    with pytest.raises(ConflictError, match=f"^{option}: the input is {kind.value}; only "):
-        check_options(kind, {"--out": None, option: 3})
+    for value in (3, 0, 0.0):
+        with pytest.raises(ConflictError, match=f"^{option}: the input is {kind.value}; only "):
+            check_options(kind, {"--out": None, option: value})
     check_options(kind, {option: None, "--clean": False, "--without": []})
+
+
+def test_a_value_of_0_is_a_value(capsys, tmp_path):
+    """0 equals False: ``--seed 0`` must not become the default seed, nor ``--quality 0`` the default quality."""
+    given = ["simulate", "dark", "--sensor", "dvs128", "--roi", "8x8", "--out", tmp_path / "o"]
+    for option in ("--quality", "--samples", "--truth-every-us"):
+        assert option in fails(capsys, *given, option, "0", "--truth", "ids")
+    status, *_ = call(capsys, *given, "--seed", "0", "--duration", "0.002", "--quiet")
+    assert status == 0 and hr.Recording.load(tmp_path / "o").manifest["seed"] == 0
 
 
 def test_options_change_the_keys_of_a_run_file(capsys, tmp_path):

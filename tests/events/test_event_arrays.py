@@ -153,6 +153,20 @@ def test_mistakes_are_named(act, text):
         act()
 
 
+@pytest.mark.parametrize(("name", "kind", "value"), [("x", "i4", -1), ("y", "i2", -7), ("x", "f8", 1.5)])
+def test_places_of_other_types_are_on_the_grid_or_refused(name, kind, value):
+    """A place of −1 would be that of the last pixel; the types of other programs' arrays are taken."""
+    types = {"t_us": "i8", "x": "u4", "y": "i4", "polarity": "i1", name: kind}
+    events = np.array([(5, 1, 2, 1), (6, 3, 0, -1)], list(types.items()))
+    if kind[0] == "i":
+        assert event_frame(events, (3, 4)).tolist() == [[0, 0, 0, -1], [0, 0, 0, 0], [0, 1, 0, 0]]
+    events[name][1] = value
+    for make in (lambda: event_frame(events, (3, 4), kind="last"), lambda: time_surface(events, (3, 4)),
+                 lambda: voxel_grid(events, (3, 4))):  # fmt: skip
+        with pytest.raises(RangeError, match=rf"^events\['{name}'\] is .*expected whole numbers, 0 or more"):
+            make()
+
+
 def test_rates_of_many_intervals_are_those_of_a_histogram():
     """173 intervals of 37 µs from 411 µs on, the last one cut short; an event on a bound belongs to what follows."""
     rng, begin, end = np.random.default_rng(6), 411, 411 + 172 * 37 + 20

@@ -223,9 +223,13 @@ def test_blocks_of_a_file_of_events_follow_each_other(tmp_path, monkeypatch):
     blocks = list(open_events(path))
     assert [block.size for block in blocks] == [7] * 7 + [1]
     np.testing.assert_array_equal(np.concatenate(blocks), events)
+    # the folder of a recording stands for the events in it
+    np.testing.assert_array_equal(np.concatenate(list(open_events(tmp_path))), events)
 
 
 def test_no_file_and_no_such_format(tmp_path):
+    with pytest.raises(SpecError, match=r"events\.h5: no such file"):
+        open_events(tmp_path)
     with pytest.raises(SpecError, match=r"missing.*No such file"):
         open_events(tmp_path / "missing.raw")
     with pytest.raises(RangeError, match="expected one of evt2"):

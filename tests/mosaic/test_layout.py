@@ -77,6 +77,9 @@ def test_a_crop_keeps_phase_and_full_sensor_index(name):
         # a crop of a crop counts from the full sensor too
         inner = part.crop(tile_cols, tile_rows, tile_cols, tile_rows)
         assert (inner.row0, inner.col0) == (part.row0 + tile_rows, part.col0 + tile_cols)
+    # sizes out of arrays: a manifest takes integers of Python alone
+    of_numpy = whole.crop(*np.array([width, height, x, y]))
+    assert of_numpy == part and {type(value) for value in (of_numpy.rows, of_numpy.row0, of_numpy.col0)} == {int}
     centred = whole.crop(width, height)
     assert abs(centred.col0 + width / 2 - whole.cols / 2) <= tile_cols
     assert abs(centred.row0 + height / 2 - whole.rows / 2) <= tile_rows
@@ -93,6 +96,8 @@ def test_a_crop_keeps_phase_and_full_sensor_index(name):
         ((8, 8, 2, 0), "offset along width_px is 2; expected a multiple"),
         ((8, 8, 3260, 0), "inside the sensor"),
         ((8, 8, 0, -4), "inside the sensor"),
+        ((8.0, 8), "roi width_px is 8.0; expected a whole number"),
+        ((8, 8, 4, "4"), "roi offset along height_px is '4'; expected a whole number"),
     ],
 )
 def test_crops_that_do_not_fit(arguments, message):

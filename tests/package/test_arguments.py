@@ -7,7 +7,7 @@ import pytest
 
 import hesim_render as hr
 from hesim_render.capture import lab
-from hesim_render.capture.run_settings import require_seed
+from hesim_render.capture.run_settings import checked_seed
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.isp.denoise import reduce_noise
 from hesim_render.isp.tone import tone_local
@@ -43,7 +43,7 @@ LIMITS = [  # function, keys that are right, keys that are not
      [{"frames": 7}, {"ticks": 0}, {"ticks": 2**31}, {"trials": 3}, {"trials": 2**16}, {"seed": -1}, {"seed": 2**64},
       {"exposures": (0, 2)}, {"exposures": (2,)}, {"exposures": (2, 2, 3)}, {"parts": 7, "ticks": 70},
       {"parts": 8, "ticks": 81}, {"sensor": FREE, "parts": 7}, {"sensor": FREE, "parts": 8192}]),
-    (require_seed, [{"seed": 0}, {"seed": 2**64 - 1}], [{"seed": -1}, {"seed": 2**64}]),
+    (checked_seed, [{"seed": 0}, {"seed": 2**64 - 1}], [{"seed": -1}, {"seed": 2**64}, {"seed": 3.0}, {"seed": "7"}]),
     (lambda **keys: reduce_noise(PICTURE, **keys), [{"luma": 0.0, "chroma": 0.1}, {"luma": 0.1, "chroma": 0.0}],
      [{"luma": -1e-9}, {"chroma": -1e-9}]),
     (lambda **keys: tone_local(PICTURE, **keys), [{"compression": 1.0, "detail": 0.0}, {"detail": 4.0}],

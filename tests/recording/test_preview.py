@@ -192,6 +192,18 @@ def test_moving_scene_gets_an_animation(tmp_path):
     assert showcase.moves(Recording.load(tmp_path / "r"))
 
 
+def test_an_animation_without_events_goes_through_the_whole_recording(monkeypatch):
+    recording, shown = recordings.make("reference-bayer", frames=9), []
+    monkeypatch.setattr(showcase, "colour_picture", lambda raw, *_: shown.append(raw))
+    for steps, expected in ((4, [0, 3, 5, 8]), (30, list(range(9)))):
+        monkeypatch.setattr(showcase, "_ANIMATION_STEPS", steps)
+        showcase.animation(recording)
+        assert [
+            next(k for k, f in enumerate(recording.frames) if np.array_equal(f.raw, raw)) for raw in shown
+        ] == expected
+        shown.clear()
+
+
 def test_no_frames_and_no_events_still_make_a_picture(tmp_path):
     recordings.make("eiger", tmp_path / "a", frames=0)
     recordings.make("reference-bayer", tmp_path / "b", frames=0)

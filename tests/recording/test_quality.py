@@ -33,6 +33,15 @@ def test_bounds_are_told_where_enough_was_seen():
     assert render_lines(None) == []
 
 
+def test_the_audit_of_a_still_scene_speaks_of_frames_only_where_there_are_some():
+    part = {"deviation_noise": {"rms": 0.31}, **SHARES}
+    audit = {"frames": part, "tolerance_noise": 1.5, "verdict": "met"}
+    one = {"rms": 0.29, "p95": 0.6, "p99": 0.8}
+    for frames, start in ((None, "audit: true deviation"), (one, "audit, frames: true deviation")):
+        *_, last = render_lines({"error_noise": {"events": one, "frames": frames}, "audit": audit})
+        assert last.startswith(start)
+
+
 def test_a_few_of_the_runs_that_miss_their_quality_are_named(monkeypatch):
     """As many as fit into a line, and whether there are more; the remedy is that of the worst one."""
     monkeypatch.setattr(quality, "_MOST_NAMED", 3)
@@ -54,8 +63,8 @@ def test_a_few_of_the_runs_that_miss_their_quality_are_named(monkeypatch):
 
 
 @pytest.mark.parametrize(("shares", "told"), [
-    ({"missed": 0.0, "extra": 0.0}, "of 7 noise-free events that it saw none was missed and none was extra (too few"),
-    ({"missed": 0.012, "extra": 0.0}, "of 7 noise-free events that it saw 1.2 % are missed, 0 % extra (too few"),
+    ({"missed": 0.0, "extra": 0.0}, "events, which it saw 7 times, none was missed and none was extra (too few"),
+    ({"missed": 0.012, "extra": 0.0}, "events, which it saw 7 times, 1.2 % are missed, 0 % extra (too few"),
     ({"missed": 0.0, "extra": 0.0, "extra_at_most": 0.04}, "none was missed"),  # one of both bounds is enough
 ])  # fmt: skip
 def test_a_bound_that_says_nothing_is_no_threat(shares, told):

@@ -192,7 +192,10 @@ def test_events_file_has_the_layout_of_dsec(block, tmp_path):
 def test_event_slice_is_the_part_asked_for(tmp_path):
     recording = recordings.make("eiger", tmp_path / "r")
     everything = recordings.events_of(recordings.sensor_like("eiger"), 250_000)
-    for begin, end in ((0, 1), (999, 1000), (1000, 1001), (12_345, 54_321), (249_000, 250_001), (0, 10**9), (5, 5)):
+    whole = ((0, 1), (999, 1000), (1000, 1001), (12_345, 54_321), (249_000, 250_001), (0, 10**9), (5, 5), (-9, -3))
+    # the interval does not begin and end with whole µs
+    broken = ((999.5, 1000.5), (12_345.0, 5.4321e4), (-2.5, float("inf")), (249_999.5, 1e12), (np.float32(700), 900))
+    for begin, end in (*whole, *broken):
         part = Recording.load(tmp_path / "r").event_slice(begin, end)
         wanted = everything[(everything["t_us"] >= begin) & (everything["t_us"] < end)]
         np.testing.assert_array_equal(part, wanted)

@@ -20,7 +20,7 @@ from hesim_render.pixels.evs.events import EVENT_DTYPE, EventLabels, LabelBlock
 from hesim_render.recording.camera_files import write_kalibr_aprilgrid, write_kalibr_camchain, write_opencv_camera
 from hesim_render.recording.label_file import LabelFileWriter, read_labels
 from hesim_render.recording.truth_export import dsec_flow_image, export_truth, tum_lines
-from hesim_render.recording.truth_file import TRUTH_KINDS, truth_kinds
+from hesim_render.recording.truth_file import TRUTH_KINDS, StoredTruth, TruthRequest, truth_kinds, write_truth
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
 GEOMETRY = TRUTH_KINDS[:-1]
@@ -112,6 +112,19 @@ def test_nothing_is_written_that_was_not_asked_for(tmp_path):
     np.testing.assert_array_equal(found.stored_truth.read("events/time_us"), np.arange(0, 30_001, 5_000))
     none = simulate(moving_scene(), sensor(), duration_s=0.03, samples=2, out=tmp_path / "none")
     assert none.stored_truth is None and "truth" not in none.manifest["settings"]
+
+
+def test_a_run_shorter_than_an_inertial_sample_and_a_lamp_of_a_long_name(tmp_path):
+    name = "größte " * 20
+    glow = {"name": name, "shape": "rectangle", "size_m": [0.3, 0.2, 0], "emission": {"luminance_cd_m2": 30}}
+    scene = rendering.make_scene(
+        objects=[glow], light={"type": "none"}, camera={"origin_m": [0, 0, 2], "target_m": [0, 0, 0]}
+    )
+    request = TruthRequest(("imu", "light"), 900, np.empty((0, 24)), None, 3)
+    write_truth(tmp_path / "t.h5", SceneTruth(scene, sensor()), request)
+    stored = StoredTruth(tmp_path / "t.h5")
+    assert stored.read("light/names").tolist() == [f"objects.{name}"]
+    assert stored.read("imu/time_us").shape == (0,) and stored.read("imu/gyro_rad_per_s").shape == (0, 3)
 
 
 def test_kinds_and_intervals_that_are_none_are_refused_before_rendering():
@@ -339,6 +352,8 @@ def test_trajectories_of_tum(recorded, tmp_path):
     np.testing.assert_allclose(np.abs(camera[0, 4:]), [1, 0, 0, 0], atol=1e-9)
     np.testing.assert_allclose(camera[-1, 1:4], [0, 0.02, 1.9], atol=1e-9)
     assert tum_lines(np.array([1.5e6]), np.eye(4)[None]) == ["1.500000 0 0 0 0 0 0 1"]
+    with pytest.raises(SpecError, match="to_world mirrors its picture"):
+        tum_lines(np.array([1.5e6]), np.diag([-1.0, 1, 1, 1])[None])
 
 
 def test_calibration_of_kalibr(recorded, tmp_path):

@@ -19,7 +19,7 @@ from hesim_render.specs.run import StudyKind, study_kind
 from hesim_render.specs.sweep import RangeSpec, SweepSpec
 from hesim_render.studies import sweep as sweeps
 from hesim_render.studies import sweep_metrics
-from hesim_render.studies.sweep import sweep
+from hesim_render.studies.sweep import check_sweep, sweep
 from hesim_render.studies.sweep_metrics import RunFigures
 
 BASE = {
@@ -195,9 +195,25 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("call", [sweep, check_sweep])
+@pytest.mark.parametrize(("key", "values", "message"), [
+    ("sensor.aps.exposure_us", [2000, 464.2], r"exposure_us=464.2, .*valid integer"),
+    ("light.illuminance_lux", {"first": 30, "last": -1, "count": 3}, r"illuminance_lux=-1.0, "),
+    ("isp.demosaic.method", ["guided", "best"], r"isp.demosaic.method=best, "),
+])  # fmt: skip
+def test_every_value_is_checked_before_the_first_run(key, values, message, call, tmp_path, monkeypatch):
+    monkeypatch.setattr(sweeps, "simulate", None)
+    with pytest.raises(SpecError, match=f"^run with .*{message}"):
+        call({**BASE, "vary": {"light.illuminant": ["D65", "A"], key: values}}, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_ranges_and_files(tmp_path, capsys):
     assert RangeSpec(first=1, last=1000, count=4, scale="log").values() == [1, 10, 100, 1000]
     assert RangeSpec(first=0, last=1, count=5).values() == [0, 0.25, 0.5, 0.75, 1]
+    whole = RangeSpec(first=2, last=300, count=7, scale="log", whole=True).values()
+    assert whole == [2, 5, 11, 24, 56, 130, 300] and all(type(value) is int for value in whole)
+    assert RangeSpec(first=1, last=3, count=9, whole=True).values() == [1, 2, 3]
     assert (
         study_kind("light-and-exposure") is StudyKind.sweep
         and read_spec(SweepSpec, "light-and-exposure", "studies").vary
@@ -206,7 +222,7 @@ def test_ranges_and_files(tmp_path, capsys):
     file.write_text(json.dumps({**BASE, "vary": {}, "seeds": [5], "keep": True, "options": {"samples": 512}}))
     with pytest.raises(SystemExit) as stop:
         cli.main(["study", str(file), "--out", str(tmp_path / "out")])
-    assert stop.value.code == 0 and "1 runs in" in capsys.readouterr().out
+    assert stop.value.code == 0 and "1 run in" in capsys.readouterr().out
     (kept,) = (tmp_path / "out" / "recordings").iterdir()
     assert hr.Recording.load(kept).manifest["seed"] == 5
 

@@ -24,6 +24,7 @@ class Framing:
     Parameters
     ----------
     inside : share of the target's surface that is in the picture, 0 to 1; other objects do not count.
+    is_seen : False if no part of it is in the picture, however small.
     fills : width and height of the target's image over those of the picture.
     from_behind : True if the camera looks at the back of the target, which is black.
     mm_per_px : size of a pixel on the target's centre, across the line of sight, mm.
@@ -31,6 +32,7 @@ class Framing:
     """
 
     inside: float
+    is_seen: bool
     fills: tuple[float, float]
     from_behind: bool
     mm_per_px: float
@@ -38,10 +40,11 @@ class Framing:
 
     def __str__(self) -> str:
         width, height = self.fills
+        inside = "under 1%" if self.is_seen and self.inside < 0.01 else f"{self.inside:.0%}"
         back = ", seen from behind" if self.from_behind else ""
         return (
             f"the target's image is {width:.0%} of the picture's width and {height:.0%} of its height; "
-            f"{self.inside:.0%} of the target is in the picture{back}; "
+            f"{inside} of the target is in the picture{back}; "
             f"a pixel is {self.mm_per_px:.3g} mm on it, {self.distance_m:.4g} m away"
         )
 
@@ -86,11 +89,24 @@ def framing(spec: SceneSpec, view: View, t_us: float = 0.0) -> Framing | None:
     middle_depth = float(-((middle - camera[:3, 3]) @ camera[:3, :3])[2])
     return Framing(
         float(inside.mean()),
+        bool(inside.any()) or _is_met(points - camera[:3, 3], at.unproject(np.ones(1), camera) - camera[:3, 3]),
         (float(size[0]), float(size[1])),
         bool(towards @ pose[:3, 2] <= 0),
         pitch_mm * MM_PER_M * abs(middle_depth) / view.sensor.lens.image_distance_mm,
         float(np.linalg.norm(towards)),
     )
+
+
+def _is_met(points: NDArray[np.float64], rays: NDArray[np.float64]) -> bool:
+    """True if one of the rays [n, 3] from the origin meets the target, whose grid of points is [m², 3]: so does the
+    picture of a part of it that lies between the points.
+    """
+    grid = points.reshape(_POINTS, _POINTS, 3)
+    corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]]).reshape(4, -1, 3)
+    # a ray is within the pyramid from the origin to a cell if it is on the same side of its four faces
+    sides = np.cross(corners, np.roll(corners, -1, axis=0)) @ rays.T
+    ahead = np.einsum("kni->ni", corners) @ rays.T > 0
+    return bool((ahead & (np.all(sides >= 0, axis=0) | np.all(sides <= 0, axis=0))).any())
 
 
 def warn_if_unseen(spec: SceneSpec, view: View, duration_us: float) -> None:
@@ -108,9 +124,9 @@ def warn_if_unseen(spec: SceneSpec, view: View, duration_us: float) -> None:
     if not views:
         return
     file = f"{spec.file}: " if spec.file is not None else ""
-    if all(seen.inside == 0 for seen in views):
+    if not any(seen.is_seen for seen in views):
         problem = "no part of the target is in the picture at any time of the run (see --framing)"
-    elif all(seen.from_behind for seen in views if seen.inside > 0):
+    elif all(seen.from_behind for seen in views if seen.is_seen):
         problem = "the camera sees the target from behind, where it is black (see --framing)"
     else:
         return

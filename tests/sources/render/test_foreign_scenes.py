@@ -15,6 +15,7 @@ from mitsuba_specfilm import reference_flux
 from rendering import make_scene, mitsuba_scene, mono
 
 import hesim_render as hr
+from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.isp.develop import _illumination
 from hesim_render.mosaic.schedule import BLOCK_INTERVALS, CELL_US
@@ -31,6 +32,7 @@ from hesim_render.sources.render.scene.mitsuba_scene import _plugin_dict
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.scene import Scene
+from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.motion import TrackSpec
 
 COLS, ROWS = 16, 12
@@ -401,6 +403,54 @@ def test_objects_that_were_made_before_are_looked_into():
         RenderedFlux(scene, mono(COLS, ROWS), 2)
 
 
+def turned(matrix):
+    """A transform [4, 4] by a matrix [3, 3], moved and turned about an axis without symmetry."""
+    whole = np.eye(4)
+    whole[:3, :3] = rotation_about((0.3, -0.8, 0.5), 37.0) @ matrix
+    whole[:3, 3] = 0.4, 0.2, 0.6
+    return whole.tolist()
+
+
+def test_spheres_and_cylinders_that_would_stay_round_are_refused():
+    """Mitsuba makes a ball of any sphere, whatever its transform, and says so in its log alone."""
+    along_x = {"p0": [-0.2, 0, 0], "p1": [0.7, 0, 0]}
+    egg, tilted = np.diag([0.3, 0.45, 0.3]), np.array([[0.3, 0.1, 0], [0, 0.3, 0], [0, 0, 0.3]])
+    for shape, matrix in (
+        ({"type": "sphere"}, egg), ({"type": "sphere"}, tilted), ({"type": "cylinder"}, egg),
+        ({"type": "cylinder"}, tilted), ({"type": "cylinder", **along_x}, np.diag([0.3, 0.3, 0.45])),
+    ):  # fmt: skip
+        text = refusal({**ROOM, "ball": {**shape, "to_world": turned(matrix), "bsdf": GREY}})
+        assert text.startswith(f"mitsuba.inline.ball: shape '{shape['type']}': its to_world scales it unevenly")
+    even = {
+        "mirrored": ({"type": "sphere"}, np.diag([-0.3, 0.3, 0.3])),
+        "long": ({"type": "cylinder", "radius": 0.7}, np.diag([0.3, 0.3, 0.45])),
+        "long_x": ({"type": "cylinder", **along_x}, egg @ np.diag([1.4, 1, 1.5])),
+        "rounded": ({"type": "sphere"}, np.diag([0.3, 0.30001, 0.3])),
+    }
+    shapes = {name: {**shape, "to_world": turned(matrix), "bsdf": GREY} for name, (shape, matrix) in even.items()}
+    build(mitsuba(), mitsuba_scene({**ROOM, **shapes}).spec)
+
+
+@pytest.mark.parametrize(("largest", "is_refused"), [(0.93, False), (1.4, True)])
+def test_a_picture_of_a_lamp_that_mitsuba_would_cut_is_refused(largest, is_refused, tmp_path):
+    """In spectral scenes a picture is at most 1. The picture is in the dictionary, or in a file."""
+    mi = mitsuba()
+    values = np.full((3, 4, 3), 0.2, np.float32)
+    values[2, 1, 1] = largest
+    mi.Bitmap(values).write(str(tmp_path / "lamp.exr"))
+    for picture in ({"bitmap": mi.Bitmap(values)}, {"filename": str(tmp_path / "lamp.exr")}):
+        shine = {**LAMP, "emitter": {"type": "area", "radiance": {"type": "bitmap", **picture}}}
+        scene = mitsuba_scene({**ROOM, "lamp": shine, "ball": {**BALL, "bsdf": {
+            "type": "diffuse", "reflectance": {"type": "bitmap", **picture}}}})  # fmt: skip
+        if is_refused:
+            with pytest.raises(
+                SpecError, match=r"lamp.*texture 'bitmap': the picture of a lamp has values up to 1\.4,"
+            ):
+                build(mi, scene.spec)
+        else:
+            build(mi, scene.spec)
+
+
 def test_emitters_and_shapes_that_are_not_rendered_are_refused_by_name():
     glow = {"type": "directionalarea", "radiance": even(1.0)}
     text = refusal({**ROOM, "lamp": {**LAMP, "emitter": glow}})
@@ -431,6 +481,8 @@ def test_instances_take_the_exact_mode_and_look_like_what_they_copy(moving):
     copied, plain = (mitsuba_scene(shapes, motion) for shapes in instances())
     with pytest.raises(NeedsExactMode, match="shape 'shapegroup': its copies have no surface of their own"):
         default_flux(copied, sensor)
+    with pytest.raises(NeedsExactMode, match=r"needs the exact mode: give a number of rays \(--samples\) in place of"):
+        scene_renderer(copied, sensor, 3, quality=0.4)
     found, expected = exact_flux(copied, sensor, 64), exact_flux(plain, sensor, 64)
     if moving:  # the box in which its motion is followed is that of the copy, not of a unit cube
         corners = build(mitsuba(), copied.spec).groups["copy_0"][0].corners

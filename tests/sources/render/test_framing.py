@@ -19,6 +19,8 @@ from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 
 LIGHT = {"type": "uniform", "illuminance_lux": 100}
 CARD = {"type": "flat", "width_m": 0.3, "height_m": 0.2}
+WIDE = {"type": "flat", "width_m": 3, "height_m": 2, "bend_radius_m": 4}
+UNSEEN = "no part of the target is in the picture at any time"
 
 
 def scene_of(target=CARD, camera=None, motion=(), **sections):
@@ -81,7 +83,7 @@ def test_edges_lie_where_they_are_in_the_picture():
 @pytest.mark.parametrize(
     ("target", "camera", "motion", "told"),
     [
-        ({**CARD, "position_m": [5, 0, 0]}, None, [], "no part of the target is in the picture at any time"),
+        ({**CARD, "position_m": [5, 0, 0]}, None, [], UNSEEN),
         ({**CARD, "rotation_deg": 180}, None, [], "sees the target from behind, where it is black"),
         (CARD, None, [], None),
         # the target comes into the picture late in the run
@@ -91,8 +93,12 @@ def test_edges_lie_where_they_are_in_the_picture():
             [{"object": "target", "keyframes": [{"t_us": 0}, {"t_us": 10_000, "translation_m": [-5, 0, 0]}]}],
             None,
         ),
+        # a close look at 2 cm of a wide, bent card, between two of the points that are looked for
+        (WIDE, {"origin_m": [0.03, 0.05, 0.9], "target_m": [0.07, 0.06, 0], "horizontal_fov_deg": 1.3}, [], None),
+        (WIDE, {"origin_m": [0.03, 0.05, 0.9], "target_m": [0.07, 0.06, 2], "horizontal_fov_deg": 1.3}, [], UNSEEN),
+        (WIDE, {"origin_m": [0.03, 0.05, 0.9], "target_m": [0.07, 2.3, 0], "horizontal_fov_deg": 1.3}, [], UNSEEN),
     ],
-    ids=["outside", "behind", "seen", "comes"],
+    ids=["outside", "behind", "seen", "comes", "between", "away", "beside"],
 )
 def test_a_target_outside_the_picture_is_told(target, camera, motion, told):
     scene = scene_of(target, camera, motion)

@@ -24,9 +24,10 @@ class Noise:
     ----------
     sensor : with its noise models.
     most_power : largest factor by which the flux is multiplied later (largest over mean power of a flickering light).
+    rests : True if nothing moves, so that the same value of a pixel serves its frames and its events.
     """
 
-    def __init__(self, sensor: Sensor, most_power: float = 1.0) -> None:
+    def __init__(self, sensor: Sensor, most_power: float = 1.0, rests: bool = False) -> None:
         self._sensor, self._power = sensor, most_power
         spec, layout = sensor.spec, sensor.layout
         rows, cols = layout.tile_shape
@@ -36,9 +37,12 @@ class Noise:
                 self._is_frame[place] = True
         #: Number of the event position at each place of the tile; 0, the first one, at other places.
         self._position = np.zeros((rows, cols), np.int64)
+        #: Places of both roles, if the quieter one of them decides.
+        self._is_both = np.zeros((rows, cols), np.bool_)
         if spec.evs is not None:
             for number, place in enumerate(spec.positions("evs")):
                 self._position[place] = number
+                self._is_both[place] = rests and self._is_frame[place]
 
     def of(self, role: Role, index: NDArray[np.uint32]) -> NoiseUnit:
         """Noise unit of listed pixels. A pixel without the role takes that of the first position that has it.
@@ -64,10 +68,16 @@ class Noise:
         events = self._event_unit(self._position[place])
         if role == "events" or self._sensor.spec.aps is None:
             return events
-        frames, is_frame = self._frame_unit(), self._is_frame[place]
-        if is_frame.all():
+        frames, is_frame, is_both = self._frame_unit(), self._is_frame[place], self._is_both[place]
+        if is_frame.all() and not is_both.any():
             return frames
-        return lambda flux: np.where(is_frame, frames(flux), events(flux))
+
+        def unit(flux: NDArray[np.float32]) -> NDArray[np.float32]:
+            of_frames, of_events = frames(flux), events(flux)
+            either = np.where(is_both, np.minimum(of_frames, of_events), of_frames)
+            return np.where(is_frame, either, of_events)
+
+        return unit
 
     def _frame_unit(self) -> NoiseUnit:
         noise, power = self._sensor.aps, np.float32(self._power)

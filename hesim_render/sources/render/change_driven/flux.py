@@ -96,9 +96,10 @@ class ChangeDrivenFlux:
         self.view, self.sensor = self._tracer.view, self._tracer.sensor
         tracer = self._tracer
         most_power = 1.0 if light is None else light.highest
-        self._renderer = AdaptiveRenderer(tracer, Noise(self.sensor, most_power), quality, tuning.at(quality))
+        self.is_static = not tracer.parts.groups and tracer.camera is None
+        noise = Noise(self.sensor, most_power, rests=self.is_static)
+        self._renderer = AdaptiveRenderer(tracer, noise, quality, tuning.at(quality))
         self._clock = MotionClock(self.view, tracer.camera, tracer.parts.groups, partial(least_depth_m, tracer))
-        self.is_static = not self._tracer.parts.groups and self._tracer.camera is None
         self._index = self._renderer.index
         #: References of the audit; a small run asks for the same pairs again and again.
         self._known: dict[tuple[Role, float], KnownPairs] = {}

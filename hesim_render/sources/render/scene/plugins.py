@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.parsed_scene import children_of
@@ -18,6 +20,10 @@ from hesim_render.sources.render.scene.plugin_tables import (
     REFUSED,
 )
 
+#: Shapes that stay round whatever their transform, and the largest part by which it may differ from a scale.
+_ROUND, _UNEVEN = ("sphere", "cylinder"), 1e-3
+#: Largest value of a picture of light, but for rounding.
+_WHITE = 1.001
 _THROUGH_MEDIA = ("volpath", "volpathmis")
 #: Integrators whose path length can be set.
 _HAVE_DEPTH = ("path", *_THROUGH_MEDIA)
@@ -180,8 +186,45 @@ def _why_refused(used: Used) -> str | None:
         return why
     if used.node is None and used.kind not in ("Integrator", "Sensor"):
         return None  # an object of a Mitsuba class that no table refuses
+    if used.name in _ROUND and (why := _why_not_round(used.node.props)) is not None:
+        return why
+    if used.name == "bitmap" and any(owner.type.name == "Emitter" for owner in used.owners):
+        return _why_too_bright(used.node.props)
     known = HONOURED.get(used.kind, ()) + OF_THE_SENSOR_FILE.get(used.kind, ())
     return None if used.name in known else _unknown(used.kind)
+
+
+def _why_not_round(properties: Any) -> str | None:
+    """Why a sphere or a cylinder would become another shape than its transform says; Mitsuba only logs that."""
+    matrix = np.eye(3)
+    if "to_world" in properties:
+        matrix = np.array(properties["to_world"].matrix, np.float64)[:3, :3]
+    if "p0" in properties and "p1" in properties:
+        axis = np.subtract(properties["p1"], properties["p0"], dtype=np.float64)
+        matrix = matrix @ np.linalg.svd(axis[None])[2].T[:, [1, 2, 0]]
+    # a rotation times a scale has perpendicular columns, and those across the axis are of the same length
+    products = matrix.T @ matrix
+    across = 2 if properties.plugin_name() == "cylinder" else 3
+    even = np.diag(np.concatenate([np.full(across, products[0, 0]), np.diag(products)[across:]]))
+    if np.abs(products - even).max() <= _UNEVEN * np.abs(products).max():
+        return None
+    return "its to_world scales it unevenly, and Mitsuba would leave it round; use a mesh, or an 'instance' of it"
+
+
+def _why_too_bright(properties: Any) -> str | None:
+    """Why Mitsuba would not shine as the picture of a lamp says: in spectral scenes it cuts pictures at 1, silently."""
+    import mitsuba as mi
+
+    picture = properties.get("bitmap", None) or properties.get("data", None)
+    if picture is None:
+        picture = mi.Bitmap(str(mi.file_resolver().resolve(properties["filename"])))  # type: ignore[operator]
+    values = np.array(picture)
+    if values.dtype.kind != "f" or not values.size or float(values.max()) <= _WHITE:
+        return None
+    return (
+        f"the picture of a lamp has values up to {values.max():.3g}, and Mitsuba cuts them at 1; scale the picture to "
+        "1, and the light with radiance_scale or a level"
+    )
 
 
 def _unknown(kind: str) -> str:

@@ -30,7 +30,6 @@ from hesim_render.core.device_types import (
     Float,
     Interaction,
     Mask,
-    MitsubaModule,
     MitsubaObject,
     Ray,
     UInt32,
@@ -40,6 +39,7 @@ from hesim_render.core.tables import table
 from hesim_render.sources.render.scene import lights
 from hesim_render.sources.render.scene.surfaces import Paint
 from hesim_render.sources.render.transport.irradiance import RectangleLight
+from hesim_render.sources.render.transport.leaving import Leaving
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.outlines import OccludedSky
 from hesim_render.sources.render.transport.swept_boxes import Moment
@@ -69,7 +69,6 @@ class DiffuseIntegrator:
         given: Sequence[LightSpec],
         responses: Mapping[str, Spectrum],
     ) -> None:
-        mi = scene.mi
         self._scene = scene
         levels = [irradiance(light) for light in given]
         skies = [level for light, level in zip(given, levels, strict=True) if light.type == "uniform" and level]
@@ -83,17 +82,17 @@ class DiffuseIntegrator:
             geometry = lights.geometry_on_plane(light, lights.key_of(given, number))
             if light.type == "area":
                 lamp_of[lights.name_of(given, number)] = len(self._lights)
-                self._lights.append(_Lamp(mi, lights.area_light_frame(light), geometry))
+                self._lights.append(_Lamp(scene.leaving, lights.area_light_frame(light), geometry))
             elif light.type == "point":
-                self._lights.append(_Point(mi, np.array(light.position_m, np.float64), geometry))
+                self._lights.append(_Point(scene.leaving, np.array(light.position_m, np.float64), geometry))
             else:
-                self._lights.append(_Beam(mi, lights.beam_direction(light), geometry))
+                self._lights.append(_Beam(scene.leaving, lights.beam_direction(light), geometry))
             # a ray that hits the light itself carries S_k/geometry
             strengths.append(level.scaled(1 / geometry))
         irradiances = [level for light, level in zip(given, levels, strict=True) if level and light.type != "uniform"]
         if skies:
             sky = summed(*skies) if len(skies) > 1 else skies[0]
-            self._lights.append(_Sky(mi))
+            self._lights.append(_Sky(scene.leaving))
             irradiances.append(sky)
             strengths.append(sky.scaled(1 / pi))
         self._has_sky = bool(skies)
@@ -212,9 +211,9 @@ class DiffuseIntegrator:
 class _Lamp:
     """A rectangle light; its strength is its radiance."""
 
-    def __init__(self, mi: MitsubaModule, frame: NDArray[np.float64], geometry: float) -> None:
-        self._rectangle = RectangleLight(mi, frame)
-        self._scale = dr.opaque(mi.Float, 1 / geometry)
+    def __init__(self, leaving: Leaving, frame: NDArray[np.float64], geometry: float) -> None:
+        self._rectangle, self._leaving = RectangleLight(leaving.mi, frame), leaving
+        self._scale = dr.opaque(leaving.mi.Float, 1 / geometry)
 
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
         """e_k and r at surface points, and the shadow ray to the point drawn on the light.
@@ -226,13 +225,15 @@ class _Lamp:
         sampler : random numbers.
         """
         drawn, share = self._rectangle.sample(point.p, normal, sampler.next_2d())
-        return self._rectangle.irradiance(point.p, normal) * self._scale, share * self._scale, point.spawn_ray_to(drawn)
+        shadow = self._leaving.to(point, drawn)
+        return self._rectangle.irradiance(point.p, normal) * self._scale, share * self._scale, shadow
 
 
 class _Point:
     """A point light; its strength is its intensity."""
 
-    def __init__(self, mi: MitsubaModule, position: NDArray[np.float64], geometry: float) -> None:
+    def __init__(self, leaving: Leaving, position: NDArray[np.float64], geometry: float) -> None:
+        mi, self._leaving = leaving.mi, leaving
         self._position, self._scale = mi.Point3f(position), dr.opaque(mi.Float, 1 / geometry)
         dr.make_opaque(self._position)
 
@@ -241,30 +242,31 @@ class _Point:
         to = self._position - point.p
         square = dr.squared_norm(to)
         level = dr.maximum(dr.dot(to, normal), 0.0) * dr.rsqrt(square) / square * self._scale
-        return level, level, point.spawn_ray_to(self._position)
+        return level, level, self._leaving.to(point, self._position)
 
 
 class _Beam:
     """Parallel light; its strength is the irradiance across the beam."""
 
-    def __init__(self, mi: MitsubaModule, direction: NDArray[np.float64], geometry: float) -> None:
+    def __init__(self, leaving: Leaving, direction: NDArray[np.float64], geometry: float) -> None:
+        mi, self._leaving = leaving.mi, leaving
         self._towards, self._scale = mi.Vector3f(-direction), dr.opaque(mi.Float, 1 / geometry)
         dr.make_opaque(self._towards)
 
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
         """See `_Lamp.seen_from`."""
         level = dr.maximum(dr.dot(self._towards, normal), 0.0) * self._scale
-        return level, level, point.spawn_ray(self._towards)
+        return level, level, self._leaving.along(point, self._towards)
 
 
 class _Sky:
     """Uniform light from all directions; its strength is its radiance, and e_k is 1."""
 
-    def __init__(self, mi: MitsubaModule) -> None:
-        self._mi = mi
+    def __init__(self, leaving: Leaving) -> None:
+        self._leaving = leaving
 
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
         """See `_Lamp.seen_from`. Directions have a cosine distribution, so r is 1 as well."""
-        mi = self._mi
+        mi = self._leaving.mi
         local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
-        return mi.Float(1.0), mi.Float(1.0), point.spawn_ray(mi.Frame3f(normal).to_world(local))
+        return mi.Float(1.0), mi.Float(1.0), self._leaving.along(point, mi.Frame3f(normal).to_world(local))

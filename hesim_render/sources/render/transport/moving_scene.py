@@ -33,6 +33,7 @@ from hesim_render.sources.render.scene.builder import BuiltScene, NeedsExactMode
 from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.closed_form import Part, surface_of
+from hesim_render.sources.render.transport.leaving import Leaving
 from hesim_render.sources.render.transport.many_objects import Fleet
 from hesim_render.sources.render.transport.motion_bounds import stays_in
 from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows, inverse_of, meets_box
@@ -165,6 +166,8 @@ class MovingScene:
         self.has_sky = any(light.is_environment() for light in lights)
         boxes = [light.get_shape().bbox() for light in lights if light.get_shape() is not None]
         self.lamp_boxes = np.array([[box.min, box.max] for box in boxes], dtype=np.float64).reshape(-1, 2, 3)
+        #: What begins the rays that leave surfaces.
+        self.leaving = Leaving(mi, built.scene)
         self._resting = Part(mi, self.static, apart=False)
         self.groups, faces = [], self._resting.face_count
         for name, shapes in parts.items():

@@ -118,7 +118,7 @@ class PathIntegrator:
             asks = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             seen, weight = scene.static.sample_emitter_direction(surface.world, light, False, asks)
             asks &= seen.pdf != 0
-            shadow = surface.world.spawn_ray_to(seen.p)
+            shadow = scene.leaving.to(surface.world, seen.p)
             infinite = mi.has_flag(seen.emitter.flags(), mi.EmitterFlags.Infinite)
             # a sky has no distance; Mitsuba gives it one that depends on the size of the resting scene
             shadow.d = dr.select(infinite, seen.d, shadow.d)
@@ -147,7 +147,7 @@ class PathIntegrator:
 
             # sample the next direction of the path
             chosen_weight = si.to_world_mueller(chosen_weight, -chosen.wo, si.wi)
-            following = surface.world.spawn_ray(surface.to_world(chosen.wo))
+            following = scene.leaving.along(surface.world, surface.to_world(chosen.wo))
             ray.o, ray.d, ray.maxt = following.o, following.d, following.maxt
             throughput = dr.select(goes_on, throughput * chosen_weight, throughput)
             stretch *= dr.select(goes_on, chosen.eta, 1.0)
