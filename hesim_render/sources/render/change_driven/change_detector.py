@@ -24,9 +24,9 @@ from hesim_render.sources.render.change_driven.windows import Windows
 DETECTOR_RAYS = 8
 #: Largest scatter of single rays of an even pixel, in wanted errors; with 1 or 4, errors and rays are the same. Of one
 #: deviating ray in 32, the mild scatter is this part.
-_EVEN, _MILD = np.float32(2.0), np.float32(32**-0.25)
+_EVEN, _MILD = np.float32(6.0), np.float32(32**-0.25)
 #: Relative differences of fluxes that rounding explains, and differences over the wanted error that count as none.
-_ROUNDING, _SAME = np.float32(1e-5), np.float32(0.2)
+_ROUNDING, _SAME = np.float32(1e-5), np.float32(1.0)
 #: Maps the flux of each site to the wanted error of a pair, both [site], e⁻/s.
 Wanted = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
@@ -77,6 +77,7 @@ def windows_with_changes(
     wanted: Wanted,
     width_px: float,
     mild: bool = False,
+    shadows: NDArray[np.uint32] | None = None,
 ) -> NDArray[np.bool_]:
     """Windows between the first and the last one in which the pilot looks with all its rays, [window, site].
 
@@ -96,6 +97,7 @@ def windows_with_changes(
     wanted : wanted error of each site.
     width_px : width of the area in which the rays start, px.
     mild : take the mild scatter, see `PilotFlux`.
+    shadows : [site], known shadows, see `PairTracer.trace`; None for none.
     """
     count, size = numbers.shape
     most = _EVEN * _MILD if mild else _EVEN
@@ -111,6 +113,7 @@ def windows_with_changes(
             *(sites.index[site], numbers[window, site], windows, DETECTOR_RAYS, width_px, Stream.RENDER_DETECTOR),
             repeat=number,
             mild=mild,
+            shadows=None if shadows is None else shadows[site],
         )
         flux_there, scatter_there = _better(got)
         # what this set saw of each site the last time, and when
