@@ -43,7 +43,7 @@ def least_change(flux: NDArray[np.float32], wanted: Wanted | None) -> NDArray[np
     return least if wanted is None else np.maximum(least, _SAME * wanted(flux))
 
 
-def _better(seen: PilotFlux) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def better_estimate(seen: PilotFlux) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Flux by the estimator that scatters less, and its scatter, e⁻/s."""
     controlled = seen.controlled_scatter <= seen.plain_scatter
     flux = np.where(controlled, seen.controlled, seen.plain)
@@ -101,7 +101,7 @@ def windows_with_changes(
     """
     count, size = numbers.shape
     most = _EVEN * _MILD if mild else _EVEN
-    flux, scatter = _better(first)
+    flux, scatter = better_estimate(first)
     even = near & (scatter <= most * wanted(flux))
     place = np.flatnonzero(even)
     # [window, site]; `seen` where few rays have looked
@@ -115,7 +115,7 @@ def windows_with_changes(
             mild=mild,
             shadows=None if shadows is None else shadows[site],
         )
-        flux_there, scatter_there = _better(got)
+        flux_there, scatter_there = better_estimate(got)
         # what this set saw of each site the last time, and when
         last, when = np.zeros(size, np.float32), np.zeros(size, np.int64)
         ends = np.searchsorted(window, np.arange(count + 1))

@@ -54,10 +54,10 @@ class Looks:
         self._in_all([self._last])
         return PilotFlux(met=self._near, **{name: values[self._last] for name, values in self.tables.items()})
 
-    def put(self, window: int, place: NDArray[np.int64], seen: PilotFlux) -> None:
-        """Put in what some sites show in a window; their changes stay."""
+    def put(self, window: int, seen: PilotFlux) -> None:
+        """Put in what all sites show in a window; their changes stay."""
         for name in STATISTICS:
-            self.tables[name][window, place] = getattr(seen, name)
+            self.tables[name][window] = getattr(seen, name)
 
     def wherever(self, marked: NDArray[np.bool_]) -> None:
         """Look at sites in the windows in which they are marked, [window, site], the last one left out; in all others

@@ -19,6 +19,7 @@ from hesim_render.sources.render.change_driven.aim import Aims
 from hesim_render.sources.render.change_driven.change_detector import (
     DETECTOR_RAYS,
     Wanted,
+    better_estimate,
     windows_with_changes,
 )
 from hesim_render.sources.render.change_driven.deep_shadow import DeepShadow
@@ -27,10 +28,15 @@ from hesim_render.sources.render.change_driven.neighbours import Sites
 from hesim_render.sources.render.change_driven.pair_flux import CHANGES, STATISTICS, PilotFlux, PilotRays, joined
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.small_objects import Look
+from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
 
 #: Hidden light, in wanted errors, from which on shapes that hide it are looked for.
 _HIDDEN = np.float32(4)
+#: Rays with known shadows over those without, above which a ray is too slow for them to pay.
+_FEWER = np.float32(0.5)
+#: Law of direct light, the only one with known shadows.
+_GAIN = Gain(*TUNING.diffuse_gain)
 
 
 @dataclass(frozen=True)
@@ -190,13 +196,8 @@ def take_pilot(
         before = anchored.rays, every
         first, own_rays = tracer.pilot_rays(sites.index, numbers[0], *given, span_us=span_us, before=before, mild=mild)
     # known shadows [window, site]: shapes that hide light in the first window do so in those that follow
-    shadows = np.zeros((count, sites.size), np.uint32)
-    shadows[:] = known_shadows(tracer, (sites.index, numbers[0], windows), first, wanted, width_px)
-    # what the same rays see with them takes the place of what they saw without
-    some = np.flatnonzero(shadows[0])
-    if some.size:
-        again = sites.index[some], numbers[0, some], *given
-        first = first.with_means(some, tracer.pilot(*again, mild=mild, shadows=shadows[0, some]))
+    shadows, given_shadows = np.zeros((count, sites.size), np.uint32), (rays, width_px, wanted, mild)
+    first, shadows[:] = with_known_shadows(tracer, (sites.index, numbers[0], windows), first, *given_shadows)
     knows = tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
     near = first.met if knows else np.ones(sites.size, np.bool_)
 
@@ -218,13 +219,10 @@ def take_pilot(
     if count > 1 and near.any():
         # the last window is the first of the next block, whose shadows are its own
         shadows[-1, near] = 0
-        at_end, pairs = looks.at_end(), (sites.index, numbers[-1], windows)
-        own = known_shadows(tracer, pairs, at_end, wanted, width_px, among=near)
+        pairs = sites.index, numbers[-1], windows
+        at_end, own = with_known_shadows(tracer, pairs, looks.at_end(), *given_shadows, among=near)
         shadows[-1, near] = own[near]
-        some = np.flatnonzero(own)
-        if some.size:
-            again = sites.index[some], numbers[-1, some], *given
-            looks.put(count - 1, some, tracer.pilot(*again, mild=mild, shadows=own[some]))
+        looks.put(count - 1, at_end)
         if stride == 1 and rays > DETECTOR_RAYS and wanted is not None and count > 2:
             # few rays tell which windows show anything new
             of = tracer, sites, numbers, windows, first, near, wanted, width_px, mild
@@ -248,33 +246,58 @@ def take_pilot(
     return replace(pilot, refined=refined, aims=aims, change=change, all_move=moves, shadows=shadows), near
 
 
-def known_shadows(
+def with_known_shadows(
     tracer: PairTracer,
     pairs: tuple[NDArray[np.uint32], NDArray[np.integer], Windows],
     seen: PilotFlux,
-    wanted: Wanted | None,
+    rays: int,
     width_px: float,
+    wanted: Wanted | None,
+    mild: bool = False,
     stream: Stream = Stream.RENDER_PILOT,
     among: NDArray[np.bool_] | None = None,
-) -> NDArray[np.uint32]:
-    """Known shadows of pairs, see `PairTracer.shadows`, [n]; 0 where too little light is hidden to ask.
+) -> tuple[PilotFlux, NDArray[np.uint32]]:
+    """What the pilot's rays see with known shadows, where these help, and the shadows of each pair; see
+    `PairTracer.shadows`.
 
     Parameters
     ----------
     pairs : pixels [n] on the full sensor, their windows, and all windows.
     seen : what the pilot saw of them.
-    wanted : maps the flux of each pair to its wanted error, both e⁻/s; None: none are known.
-    width_px, stream : see `PairTracer.pilot`.
+    rays, width_px, mild, stream : of the pilot, see `PairTracer.pilot`.
+    wanted : maps the flux of each pair to its wanted error, both e⁻/s; None: no shadows are known.
     among : [n], pairs that are asked; None for all.
+
+    Returns
+    -------
+    seen : with the means and the scatter of the same rays with known shadows.
+    shadows : [n], 0 where none are known.
     """
     pixel, window, windows = pairs
     shadows = np.zeros(pixel.size, np.uint32)
-    if wanted is not None and tracer.knows_shadows:
-        flux = np.where(seen.controlled_scatter <= seen.plain_scatter, seen.controlled, seen.plain)
-        hidden = seen.unshadowed - flux > _HIDDEN * wanted(flux)
-        some = np.flatnonzero(hidden if among is None else hidden & among)
-        shadows[some] = tracer.shadows(pixel[some], window[some], windows, width_px, stream)
-    return shadows
+    if wanted is None or not tracer.knows_shadows:
+        return seen, shadows
+    flux, scatter = better_estimate(seen)
+    hidden = seen.unshadowed - flux > _HIDDEN * wanted(flux)
+    some = np.flatnonzero(hidden if among is None else hidden & among)
+    shadows[some] = tracer.shadows(pixel[some], window[some], windows, width_px, stream)
+    some = np.flatnonzero(shadows)
+    if some.size:
+        of = pixel[some], window[some], windows, rays, width_px, stream
+        again = tracer.pilot(*of, mild=mild, shadows=shadows[some])
+        # a ray takes longer with shadows, so these must save rays, by the scatter and by what a ray may bring
+        error, heavy = wanted(flux)[some], np.float32(TUNING.ray_weight) * wanted(flux)[some]
+        with_them, without = (
+            np.maximum(np.maximum(_GAIN.rays(each / error), light / heavy), np.float32(TUNING.least_rays))
+            for each, light in (
+                (again.controlled_scatter, again.unshadowed),
+                (scatter[some], seen.unshadowed[some]),
+            )
+        )
+        pays = with_them <= _FEWER * without
+        shadows[some[~pays]] = 0
+        seen = seen.with_means(some[pays], again, pays)
+    return seen, shadows
 
 
 def _is_window(span_us: tuple[float, float], windows: Windows, numbers: NDArray[np.int64]) -> bool:

@@ -16,7 +16,7 @@ from hesim_render.sources.render.change_driven.edges import PairEdges
 from hesim_render.sources.render.change_driven.error_target import NoiseUnit
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
-from hesim_render.sources.render.change_driven.pilot import known_shadows
+from hesim_render.sources.render.change_driven.pilot import with_known_shadows
 from hesim_render.sources.render.change_driven.small_objects import Zoom
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -124,13 +124,9 @@ def traced_again(
     def wanted_of(flux: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.float32(quality) * own_unit(flux)
 
-    shadows = known_shadows(tracer, (pixel, window, windows), pilot, wanted_of, 1.0, Stream.AUDIT_PILOT)
-    if aims is not None:
-        shadows[aims.count > 0] = 0
-    some = np.flatnonzero(shadows)
-    if some.size:
-        shadowed = pixel[some], window[some], windows, tuning.audit_pilot_rays, 1.0, Stream.AUDIT_PILOT
-        pilot = pilot.with_means(some, tracer.pilot(*shadowed, shadows=shadows[some]))
+    listed, alone = (pixel, window, windows), None if aims is None else aims.count == 0
+    given = tracer, listed, pilot, tuning.audit_pilot_rays, 1.0, wanted_of
+    pilot, shadows = with_known_shadows(*given, stream=Stream.AUDIT_PILOT, among=alone)
     # the estimator with less scatter, as in the run, by a pilot of its own
     controlled = (pilot.controlled_scatter <= pilot.plain_scatter) & (2 * pilot.controlled >= pilot.unshadowed)
     flux = np.where(controlled, pilot.controlled, pilot.plain)
@@ -153,7 +149,7 @@ def traced_again(
         if aims is not None:
             tried &= aims.count == 0
         rays, edges = about_edges(
-            *(tracer, (pixel, window, windows), law, controlled, wanted_error, floor, gain, tuning),
+            *(tracer, listed, law, controlled, wanted_error, floor, gain, tuning),
             tried=tried, flat_part=1.0, shadows=shadows, stream=Stream.AUDIT_EDGE,
         )  # fmt: skip
         wanted_times = np.where(rays < law, 1, wanted_times)

@@ -18,9 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
-from hesim_render.core.device_types import Float, Mask, MitsubaObject, Point3, Ray, UInt32, Vector3
+from hesim_render.core.device_types import Float, LoopState, Mask, MitsubaObject, Point3, Ray, UInt32, Vector3
 from hesim_render.core.tables import table
+from hesim_render.sources.render.scene.tracks import DevicePose
 from hesim_render.sources.render.transport.blockers import box_of, face_of
 from hesim_render.sources.render.transport.intersections import to_ball
 from hesim_render.sources.render.transport.irradiance import RectangleLight
@@ -54,8 +56,7 @@ class LampShadows:
         for number, part in enumerate((scene.static, *(group.scene for group in scene.groups))):
             rows += [row for shape in part.shapes() if (row := _row_of(shape, number)) is not None]
         # the largest ones, by the area of their largest face
-        rows.sort(key=lambda row: -_size(row))
-        rows = rows[:_MOST]
+        rows = sorted(sorted(rows, key=lambda row: -_size(row))[:_MOST], key=lambda row: row[3])
         self.is_known = bool(rows)
         self._moves = any(row[3] > 0 for row in rows)
         self._rows = table(mi.Float, np.array(rows or [[0.0] * _ROW], np.float32))
@@ -98,26 +99,45 @@ class LampShadows:
     def first_met(self, shadow: Ray, moment: Moment, active: Mask) -> UInt32:
         """Number, from 1, of the first shape in the list that a ray meets before its `maxt`; 0 if it meets none."""
         mi = self._scene.mi
+        none = DevicePose.none(jit().Array3f)
 
-        def look(number: UInt32, met: UInt32) -> tuple[UInt32, UInt32]:
-            hits = active & (met == 0) & self._shape(number, moment).meets(shadow)
-            return number + 1, dr.select(hits, number + 1, met)
+        def look(number: UInt32, met: UInt32, part: UInt32, *columns: Vector3) -> LoopState:
+            shape, own = self._at_rest(number)
+            # shapes are in order of their part, whose pose is computed once
+            if self._moves:
+                columns = dr.if_stmt(
+                    (own, *columns),
+                    own != part,
+                    lambda own, *_: _columns(self._scene.pose(own - 1, moment)),
+                    lambda own, *columns: columns,
+                    label="pose",
+                )
+                shape = shape.posed(DevicePose(tuple(columns[:3]), columns[3]))
+            hits = active & (met == 0) & shape.meets(shadow)
+            return number + 1, dr.select(hits, number + 1, met), own, *columns
 
-        state = mi.UInt32(0), mi.UInt32(0)
-        return dr.while_loop(state, lambda number, met: number < self._count, look, label="shapes")[1]
+        state = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0), *_columns(none)
+        return dr.while_loop(state, lambda number, *_: number < self._count, look, label="shapes")[1]
 
     def _shape(self, number: UInt32, moment: Moment) -> _Shape:
         """The shape whose number each lane holds, in world space."""
+        shape, part = self._at_rest(number)
+        if self._moves:
+            moves = part > 0
+            pose = self._scene.pose(dr.select(moves, part - 1, 0), moment)
+            shape = shape.posed(DevicePose.none(self._scene.mi.Vector3f).where(~moves, pose))
+        return shape
+
+    def _at_rest(self, number: UInt32) -> tuple[_Shape, UInt32]:
+        """The shape whose number each lane holds, in the frame of its part; and its part, 0 for what rests."""
         mi = self._scene.mi
         rows = [dr.gather(mi.Vector4f, self._rows, 4 * number + k) for k in range(4)]
-        corner, *sides = (mi.Vector3f(row.x, row.y, row.z) for row in rows)
-        if self._moves:
-            group = mi.UInt32(rows[0].w)
-            moves = group > 0
-            pose = self._scene.pose(dr.select(moves, group - 1, 0), moment)
-            corner = dr.select(moves, pose.to_world(corner), corner)
-            sides = [dr.select(moves, pose.turn_to_world(side), side) for side in sides]
-        return _Shape(mi.Point3f(corner), (sides[0], sides[1], sides[2]), rows[1].w, rows[2].w)
+        corner, a, b, c = (mi.Vector3f(row.x, row.y, row.z) for row in rows)
+        return _Shape(mi.Point3f(corner), (a, b, c), rows[1].w, rows[2].w), mi.UInt32(rows[0].w)
+
+
+def _columns(pose: DevicePose) -> tuple[Vector3, ...]:
+    return *pose.columns, pose.shift
 
 
 @dataclass
@@ -136,6 +156,11 @@ class _Shape:
     sides: tuple[Vector3, Vector3, Vector3]
     height: Float
     square: Float
+
+    def posed(self, pose: DevicePose) -> _Shape:
+        """The same shape in world space."""
+        a, b, c = (pose.turn_to_world(side) for side in self.sides)
+        return _Shape(pose.to_world(self.corner), (a, b, c), self.height, self.square)
 
     def over(self, place: Point3, along: Vector3) -> Float:
         """Least height of the shape over a plane through a place, along its unit normal, m."""
