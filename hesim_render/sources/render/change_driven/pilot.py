@@ -19,24 +19,16 @@ from hesim_render.sources.render.change_driven.aim import Aims
 from hesim_render.sources.render.change_driven.change_detector import (
     DETECTOR_RAYS,
     Wanted,
-    better_estimate,
     windows_with_changes,
 )
 from hesim_render.sources.render.change_driven.deep_shadow import DeepShadow
+from hesim_render.sources.render.change_driven.known_shadows import with_known_shadows
 from hesim_render.sources.render.change_driven.looks import Looks
 from hesim_render.sources.render.change_driven.neighbours import Sites
 from hesim_render.sources.render.change_driven.pair_flux import CHANGES, STATISTICS, PilotFlux, PilotRays, joined
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.small_objects import Look
-from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
-
-#: Hidden light, in wanted errors, from which on shapes that hide it are looked for.
-_HIDDEN = np.float32(4)
-#: Rays with known shadows over those without, above which a ray is too slow for them to pay.
-_FEWER = np.float32(0.5)
-#: Law of direct light, the only one with known shadows.
-_GAIN = Gain(*TUNING.diffuse_gain)
 
 
 @dataclass(frozen=True)
@@ -244,60 +236,6 @@ def take_pilot(
     refined = _refine(tracer, sites, windows, numbers, pilot, width_px, near_by, aims, shadows)
     moves = tracer.camera is not None
     return replace(pilot, refined=refined, aims=aims, change=change, all_move=moves, shadows=shadows), near
-
-
-def with_known_shadows(
-    tracer: PairTracer,
-    pairs: tuple[NDArray[np.uint32], NDArray[np.integer], Windows],
-    seen: PilotFlux,
-    rays: int,
-    width_px: float,
-    wanted: Wanted | None,
-    mild: bool = False,
-    stream: Stream = Stream.RENDER_PILOT,
-    among: NDArray[np.bool_] | None = None,
-) -> tuple[PilotFlux, NDArray[np.uint32]]:
-    """What the pilot's rays see with known shadows, where these help, and the shadows of each pair; see
-    `PairTracer.shadows`.
-
-    Parameters
-    ----------
-    pairs : pixels [n] on the full sensor, their windows, and all windows.
-    seen : what the pilot saw of them.
-    rays, width_px, mild, stream : of the pilot, see `PairTracer.pilot`.
-    wanted : maps the flux of each pair to its wanted error, both e⁻/s; None: no shadows are known.
-    among : [n], pairs that are asked; None for all.
-
-    Returns
-    -------
-    seen : with the means and the scatter of the same rays with known shadows.
-    shadows : [n], 0 where none are known.
-    """
-    pixel, window, windows = pairs
-    shadows = np.zeros(pixel.size, np.uint32)
-    if wanted is None or not tracer.knows_shadows:
-        return seen, shadows
-    flux, scatter = better_estimate(seen)
-    hidden = seen.unshadowed - flux > _HIDDEN * wanted(flux)
-    some = np.flatnonzero(hidden if among is None else hidden & among)
-    shadows[some] = tracer.shadows(pixel[some], window[some], windows, width_px, stream)
-    some = np.flatnonzero(shadows)
-    if some.size:
-        of = pixel[some], window[some], windows, rays, width_px, stream
-        again = tracer.pilot(*of, mild=mild, shadows=shadows[some])
-        # a ray takes longer with shadows, so these must save rays, by the scatter and by what a ray may bring
-        error, heavy = wanted(flux)[some], np.float32(TUNING.ray_weight) * wanted(flux)[some]
-        with_them, without = (
-            np.maximum(np.maximum(_GAIN.rays(each / error), light / heavy), np.float32(TUNING.least_rays))
-            for each, light in (
-                (again.controlled_scatter, again.unshadowed),
-                (scatter[some], seen.unshadowed[some]),
-            )
-        )
-        pays = with_them <= _FEWER * without
-        shadows[some[~pays]] = 0
-        seen = seen.with_means(some[pays], again, pays)
-    return seen, shadows
 
 
 def _is_window(span_us: tuple[float, float], windows: Windows, numbers: NDArray[np.int64]) -> bool:

@@ -14,9 +14,9 @@ from hesim_render.sources.render.change_driven.aim import Aims, PairAims
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
 from hesim_render.sources.render.change_driven.edges import PairEdges
 from hesim_render.sources.render.change_driven.error_target import NoiseUnit
+from hesim_render.sources.render.change_driven.known_shadows import with_known_shadows
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
-from hesim_render.sources.render.change_driven.pilot import with_known_shadows
 from hesim_render.sources.render.change_driven.small_objects import Zoom
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
