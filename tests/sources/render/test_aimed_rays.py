@@ -192,16 +192,20 @@ def test_blocks_hold_each_pair_once_and_either_kind_alone():
     packets = np.array([4, 1, 8, 2, 16, 1])
     aims = PairAims(np.zeros(6, np.uint32), np.array([0, 2, 0, 1, 0, 0], np.uint32), np.zeros(3, np.uint32))
     blocks = list(in_blocks(packets, 12, aims, None))
-    assert sorted(np.concatenate([part for part, _ in blocks])) == list(range(6))
-    for part, own in blocks:
+    assert sorted(np.concatenate([part for part, *_ in blocks])) == list(range(6))
+    for part, own, shadows in blocks:
         assert packets[part].sum() <= 12 or part.size == 1
         assert np.all(aims.count[part] > 0) if own is not None else np.all(aims.count[part] == 0)
-    assert [part for part, _ in in_blocks(packets, 12, None, None)] == [
-        slice(0, 2),
-        slice(2, 4),
-        slice(4, 5),
-        slice(5, 6),
-    ]
+        assert shadows is None
+    slices = [slice(0, 2), slice(2, 4), slice(4, 5), slice(5, 6)]
+    assert [part for part, *_ in in_blocks(packets, 12, None, None)] == slices
+    # pairs with known shadows, with and without aims; without any, blocks are the same
+    codes = np.array([0, 9, 0, 0, 259, 7], np.uint32)
+    blocks = list(in_blocks(packets, 12, aims, None, codes))
+    assert [part.tolist() for part, *_ in blocks] == [[0, 2], [4], [5], [3], [1]]
+    assert [own is not None for _, own, _ in blocks] == [False, False, False, True, True]
+    assert [None if own is None else own.tolist() for *_, own in blocks] == [None, [259], [7], None, [9]]
+    assert [part for part, *_ in in_blocks(packets, 12, None, None, 0 * codes)] == slices
 
 
 @pytest.mark.parametrize("psf_um", [0.0, 3.0])

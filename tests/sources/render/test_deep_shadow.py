@@ -17,6 +17,7 @@ from hesim_render.sources.render.change_driven.deep_shadow import DeepShadow, de
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.neighbours import Lattice, Sites
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
+from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.pilot import Pilot
 from hesim_render.sources.render.change_driven.plan import plan
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
@@ -221,8 +222,10 @@ def lamp_behind_a_plate():
     )  # fmt: skip
 
 
-def run_of(sensor, deep=True):
-    """Flux of all ticks, [tick, pixel], the source, and the calls of the pilot, (rays, stream, pairs)."""
+def run_of(sensor, deep=True, known=False):
+    """Flux of all ticks, [tick, pixel], the source, and the calls of the pilot, (rays, stream, pairs); with the plate's
+    shadow in closed form, if it is `known`.
+    """
     source, calls = ChangeDrivenFlux(lamp_behind_a_plate(), sensor, seed=4), []
     own = source._tracer.pilot
 
@@ -231,8 +234,13 @@ def run_of(sensor, deep=True):
         return own(index, window, windows, rays, width_px, stream, *given, **more)
 
     source._tracer.pilot = pilot
-    with mock.patch.object(adaptive, "deep_shadow", deep_shadow if deep else lambda *_: None):
+    knows = mock.patch.object(PairTracer, "knows_shadows", known)
+    with knows, mock.patch.object(adaptive, "deep_shadow", deep_shadow if deep else lambda *_: None):
         return fluxes(source, 0, 20_000).mean(axis=1), source, calls
+
+
+def deep_looks(calls):
+    return sum(pairs for rays, stream, pairs in calls if (rays, stream) == (256, Stream.RENDER_ZOOM))
 
 
 def test_pixels_in_deep_shadow_follow_their_light():
@@ -249,6 +257,11 @@ def test_pixels_in_deep_shadow_follow_their_light():
     off, straight = (some - truth) / unit, (none - truth) / unit
     assert np.abs(straight).max() > 12 and np.sqrt(np.mean(straight**2)) > 3
     assert np.abs(off).max() < 6 and np.sqrt(np.mean(off**2)) < 0.8
+    # a shadow in closed form needs no such looks, and fewer rays
+    exact, third, calls_then = run_of(sensor, known=True)
+    beside = (exact - truth) / unit
+    assert np.abs(beside).max() < 2.5 and np.sqrt(np.mean(beside**2)) < 0.65 and deep_looks(calls_then) < 60
+    assert third.counts.rays < source.counts.rays / 2
     # where it is worst, the block begins in the dark
     dark = np.argmax(np.abs(straight).max(axis=0))
     assert truth[2, dark] == 0 and truth[-1, dark] > 25 * unit[-1, dark]

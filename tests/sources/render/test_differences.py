@@ -55,6 +55,18 @@ def one_site(value, others=0.0):
     return table
 
 
+def test_pairs_with_known_shadows_are_no_differences():
+    """The rays with which they would be compared know no shadow."""
+    pilot, units = pilot_of(5, open_flux=200.0), np.full((5, 121), UNIT, np.float32)
+    given = sites_of(), units, QUALITY, np.ones((5, 121), bool), np.full((5, 121), 4096, np.int16), TUNING
+    shadows = np.zeros((5, 121), np.uint32)
+    shadows[[0, 2, 3], CENTRE] = 7 + (3 << 8)
+    every, some = differences(pilot, *given), differences(replace(pilot, shadows=shadows), *given)
+    assert np.all(every.rays > 0) and (some.rays[:, CENTRE] > 0).tolist() == [False, True, False, False, True]
+    others = np.arange(121) != CENTRE
+    np.testing.assert_array_equal(some.rays[:, others], every.rays[:, others])
+
+
 def test_a_choice_does_not_depend_on_pairs_that_are_not_rendered():
     """They would not be differences either if they took no rays by themselves."""
     rng = np.random.default_rng(8)
@@ -294,12 +306,13 @@ class MadeUp:
     """A tracer whose pilot has the flux `light` [window, site], and as scatter the place it is compared with."""
 
     camera = parts = rays = None
+    knows_shadows = False
 
     def __init__(self, light, near):
         self.light, self.near, self.traced = light, near, []
         self.rays, self.parts = SimpleNamespace(spreads=False), SimpleNamespace(groups=[])
 
-    def pilot(self, index, window, windows, rays, width_px, span_us=None, before=None, mild=False):
+    def pilot(self, index, window, windows, rays, width_px, span_us=None, before=None, mild=False, shadows=None):
         self.traced += zip(window.tolist(), index.tolist(), strict=True)
         found = PilotFlux.empty(index.size)
         found.controlled[:], found.plain[:] = self.light[window, index], 0.5 * self.light[window, index]

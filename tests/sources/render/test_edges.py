@@ -249,7 +249,7 @@ def test_rays_follow_from_what_the_decision_rays_saw():
         np.ones(8), np.zeros(8), np.zeros(8), np.zeros(8), gap, np.full(8, 7.0), 7 + contrast, scatter,
         np.full(8, 20.0), np.full(8, 128.0),
     )))  # fmt: skip
-    tried = []
+    tried, shown = [], []
 
     class Tracer:
         moves = False
@@ -257,8 +257,9 @@ def test_rays_follow_from_what_the_decision_rays_saw():
         def moves_within(self, windows):
             return self.moves
 
-        def edges(self, pixel, window, windows, samples, footprint_px, controlled, least, stream, moves):
+        def edges(self, pixel, window, windows, samples, footprint_px, controlled, least, stream, moves, shadows):
             assert moves == self.moves
+            shown.append(None if shadows is None else shadows.tolist())
             tried.append((pixel.tolist(), samples, footprint_px, stream))
             np.testing.assert_allclose(least, 4 * 2.5)  # wanted errors on the axis
             return EdgeFit(*(getattr(fit, name)[pixel] for name in vars(fit)))
@@ -278,8 +279,8 @@ def test_rays_follow_from_what_the_decision_rays_saw():
     assert tried == [(list(range(7)), 64, 1.5, Stream.RENDER_EDGE)]
     np.testing.assert_allclose(edges.half_width[:2], [0.009, 0.014], rtol=1e-5)
     rays, edges = about_edges(Tracer(), (pixel, 0 * pixel, None), *given, tried=pixel == 2, flat_part=0.5,
-                              stream=Stream.AUDIT_EDGE)  # fmt: skip
-    assert rays.tolist() == [2048, 4096, 1024, *law[3:]] and edges is None
+                              shadows=7 + pixel, stream=Stream.AUDIT_EDGE)  # fmt: skip
+    assert rays.tolist() == [2048, 4096, 1024, *law[3:]] and edges is None and shown == [None, [9]]
     assert tried[1][0] == [2] and tried[1][3] == Stream.AUDIT_EDGE
     # a line that may move takes half a ray for each wanted error of contrast
     moving = Tracer()

@@ -314,7 +314,8 @@ class Deciding:
     def moves_within(self, windows):
         return False
 
-    def edges(self, index, window, windows, rays, width_px, controlled, little, stream=Stream.RENDER_EDGE, moves=False):
+    def edges(self, index, window, windows, rays, width_px, controlled, little, stream=Stream.RENDER_EDGE, moves=False,
+              shadows=None):  # fmt: skip
         keys = [(w - 2, INDEX.tolist().index(i)) for w, i in zip(window.tolist(), index.tolist(), strict=True)]
         assert (rays, width_px, stream, moves) == (64, 1.5, Stream.RENDER_EDGE, False)
         wanted = [4 * ERROR[p] / FACTOR[p] for _, p in keys]

@@ -203,7 +203,8 @@ class AdaptiveRenderer:
         index = band.index[np.nonzero(which)[1]]
         little = np.float32(tuning.flat_contrast) * what.wanted[which] / self.tracer.axis_factor(index)
         of = index, numbers[which], windows, tuning.edge_rays, tuning.edge_footprint_px
-        fit = self.tracer.edges(*of, what.controlled[which], little)
+        shadows = None if what.shadows is None else what.shadows[which]
+        fit = self.tracer.edges(*of, what.controlled[which], little, shadows=shadows)
         self.counts.rays += self.tracer.rays_done - before
         return fit
 
@@ -240,7 +241,10 @@ class AdaptiveRenderer:
         aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
         pairs = band.index[place], numbers[todo], windows
         rays, edges = self.rays_of(pairs, what, todo, aims, fit)
-        got = self.tracer.trace(*pairs, rays, what.controlled[todo], span_us=span_us, aims=aims, edges=edges)
+        shadows = None if what.shadows is None else what.shadows[todo]
+        got = self.tracer.trace(
+            *(*pairs, rays, what.controlled[todo]), span_us=span_us, aims=aims, edges=edges, shadows=shadows
+        )
         self.counts.rays += self.tracer.rays_done - before
         self.counts.pairs += place.size
         if not self.tracer.is_diffuse:
@@ -278,7 +282,10 @@ class AdaptiveRenderer:
         tried = None if aims is None else aims.count == 0
         given = rays, what.controlled[todo], what.wanted[todo], what.floor[todo]
         known = None if fit is None else (what.fitted[todo], fit.at(todo[what.fitted]))
-        return about_edges(self.tracer, pairs, *given, self.gain, self.tuning, tried=tried, known=known)
+        shadows = None if what.shadows is None else what.shadows[todo]
+        return about_edges(
+            *(self.tracer, pairs, *given, self.gain, self.tuning), tried=tried, known=known, shadows=shadows
+        )
 
     def alone(
         self,

@@ -95,17 +95,23 @@ class PairAims:
 
 
 def in_blocks(
-    packets: NDArray[np.int64], room: int, aims: PairAims | None, edges: PairEdges | None
-) -> Iterator[tuple[slice | NDArray[np.int64], PairAims | PairEdges | None]]:
-    """Pairs that are traced together, and what half of their rays are aimed at.
+    packets: NDArray[np.int64],
+    room: int,
+    aims: PairAims | None,
+    edges: PairEdges | None,
+    shadows: NDArray[np.uint32] | None = None,
+) -> Iterator[tuple[slice | NDArray[np.int64], PairAims | PairEdges | None, NDArray[np.uint32] | None]]:
+    """Pairs that are traced together, what half of their rays are aimed at, and their known shadows.
 
-    Pairs with aimed rays have a kernel of their own, so that the bits of the others do not depend on their company.
+    Pairs with aimed rays or known shadows have a kernel of their own, so that the bits of the others do not depend on
+    their company.
 
     Parameters
     ----------
     packets : [n], packets of rays of each pair.
     room : largest number of packets at a time, unless a single pair has more.
     aims, edges : small objects and edges of all pairs; None where there are none. A pair has one kind at most.
+    shadows : codes of `LampShadows` of all pairs, 0 where none are known; None for none.
     """
     plain = np.ones(packets.size, np.bool_)
     alike: list[tuple[NDArray[np.int64] | None, PairAims | PairEdges | None]] = []
@@ -118,7 +124,15 @@ def in_blocks(
             plain &= ~has_any
     # plain pairs first; where there are no others, a slice saves the copy
     alike.insert(0, (np.flatnonzero(plain) if alike else None, None))
+    by_shadow: list[tuple[NDArray[np.int64] | None, PairAims | PairEdges | None, NDArray[np.uint32] | None]] = []
     for places, aimed in alike:
+        if shadows is None or not shadows.any():
+            by_shadow.append((places, aimed, None))
+            continue
+        every = np.arange(packets.size) if places is None else places
+        by_shadow.append((every[shadows[every] == 0], aimed, None))
+        by_shadow.append((every[shadows[every] > 0], aimed, shadows))
+    for places, aimed, own in by_shadow:
         ends = np.cumsum(packets if places is None else packets[places])
         first = 0
         while first < ends.size:
@@ -126,7 +140,7 @@ def in_blocks(
             done = int(ends[first - 1]) if first else 0
             last = max(first + 1, int(np.searchsorted(ends, done + room, side="right")))
             part = slice(first, last) if places is None else places[first:last]
-            yield part, None if aimed is None else aimed.part(part)
+            yield part, None if aimed is None else aimed.part(part), None if own is None else own[part]
             first = last
 
 

@@ -22,9 +22,9 @@ from hesim_render.sources.render.change_driven.windows import Windows
 DETECTOR_RAYS = 8
 #: Largest scatter of single rays of an even pixel, in wanted errors; with 1 or 4, errors and rays are the same. Of one
 #: deviating ray in 32, the mild scatter is this part.
-_EVEN, _MILD = np.float32(2.0), np.float32(32**-0.25)
+_EVEN, _MILD = np.float32(6.0), np.float32(32**-0.25)
 #: Relative differences of fluxes that rounding explains, and differences over the wanted error that count as none.
-_ROUNDING, _SAME = np.float32(1e-5), np.float32(0.2)
+_ROUNDING, _SAME = np.float32(1e-5), np.float32(1.0)
 #: Maps the flux of each site to the wanted error of a pair, both [site], e⁻/s.
 Wanted = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
@@ -41,7 +41,7 @@ def least_change(flux: NDArray[np.float32], wanted: Wanted | None) -> NDArray[np
     return least if wanted is None else np.maximum(least, _SAME * wanted(flux))
 
 
-def _better(seen: PilotFlux) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def better_estimate(seen: PilotFlux) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Flux by the estimator that scatters less, and its scatter, e⁻/s."""
     controlled = seen.controlled_scatter <= seen.plain_scatter
     flux = np.where(controlled, seen.controlled, seen.plain)
@@ -75,6 +75,7 @@ def windows_with_changes(
     wanted: Wanted,
     width_px: float,
     mild: bool = False,
+    shadows: NDArray[np.uint32] | None = None,
 ) -> NDArray[np.bool_]:
     """Windows between the first and the last one in which the pilot looks with all its rays, [window, site].
 
@@ -94,10 +95,11 @@ def windows_with_changes(
     wanted : wanted error of each site.
     width_px : width of the area in which the rays start, px.
     mild : take the mild scatter, see `PilotFlux`.
+    shadows : [site], known shadows, see `PairTracer.trace`; None for none.
     """
     count, size = numbers.shape
     most = _EVEN * _MILD if mild else _EVEN
-    flux, scatter = _better(first)
+    flux, scatter = better_estimate(first)
     even = near & (scatter <= most * wanted(flux))
     place = np.flatnonzero(even)
     # [window, site]; `seen` where few rays have looked
@@ -109,8 +111,9 @@ def windows_with_changes(
             *(sites.index[site], numbers[window, site], windows, DETECTOR_RAYS, width_px, Stream.RENDER_DETECTOR),
             repeat=number,
             mild=mild,
+            shadows=None if shadows is None else shadows[site],
         )
-        flux_there, scatter_there = _better(got)
+        flux_there, scatter_there = better_estimate(got)
         # what this set saw of each site the last time, and when
         last, when = np.zeros(size, np.float32), np.zeros(size, np.int64)
         ends = np.searchsorted(window, np.arange(count + 1))

@@ -152,6 +152,9 @@ def differences(
         which, place = np.nonzero(out.rays)
         is_aimed = pilot.aims.at(which, sites.listed[place]).count > 0
         out.rays[which[is_aimed], place[is_aimed]] = 0
+    if pilot.shadows is not None:
+        # the rays to compare with do not know any shadows
+        out.rays[pilot.shadows[:, sites.listed] > 0] = 0
     # all windows between take as many rays as the one that needs most, and together pay for those in the first window
     some = np.flatnonzero(out.rays[inner].any(axis=0))
     own = out.rays[inner, some]

@@ -23,6 +23,7 @@ def about_edges(
     tried: NDArray[np.bool_] | None = None,
     flat_part: float | None = None,
     known: tuple[NDArray[np.bool_], EdgeFit] | None = None,
+    shadows: NDArray[np.uint32] | None = None,
     stream: Stream = Stream.RENDER_EDGE,
 ) -> tuple[NDArray[np.integer], PairEdges | None]:
     """Models of the edges in listed pairs, and the numbers of rays that are left to trace.
@@ -42,6 +43,7 @@ def about_edges(
     tried : [n], pairs that may have an edge; None for all.
     flat_part : in place of `Tuning.flat_part`.
     known : [n], pairs whose lines are known, and these lines.
+    shadows : [n], see `PairTracer.trace`.
     stream : stream of the decision rays.
 
     Returns
@@ -65,7 +67,7 @@ def about_edges(
     some, little = place[new], np.float32(tuning.flat_contrast) * wanted[new]
     of = pixel[some], window[some], windows, tuning.edge_rays, tuning.edge_footprint_px, controlled[some], little
     moves = tracer.moves_within(windows)
-    fit.replace(new, tracer.edges(*of, stream, moves))
+    fit.replace(new, tracer.edges(*of, stream, moves, None if shadows is None else shadows[some]))
     contrast = (fit.high - fit.low) / wanted
     is_edge = fit.is_edge & (contrast >= 1)
     # both sides belong to the scatter of a pair that has no edge

@@ -8,11 +8,7 @@ from numpy.typing import NDArray
 
 from hesim_render.sources.render.change_driven.change_detector import Wanted, least_change
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
-from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
-
-#: Statistics of a look, and those that compare its rays with the same rays in another window.
-STATISTICS = ("controlled", "plain", "controlled_scatter", "plain_scatter", "unshadowed")
-CHANGES = ("controlled_change", "plain_change")
+from hesim_render.sources.render.change_driven.pair_flux import CHANGES, STATISTICS, PilotFlux
 
 
 class Looks:
@@ -51,18 +47,26 @@ class Looks:
             for name, values in self.tables.items():
                 values[window, place] = getattr(seen, name)
 
+    def at_end(self) -> PilotFlux:
+        """Look at all sites in the last window, which is the first of the next block; what they show there."""
+        self._in_all([self._last])
+        return PilotFlux(met=self._near, **{name: values[self._last] for name, values in self.tables.items()})
+
+    def put(self, window: int, seen: PilotFlux) -> None:
+        """Put in what all sites show in a window; their changes stay."""
+        for name in STATISTICS:
+            self.tables[name][window] = getattr(seen, name)
+
     def wherever(self, marked: NDArray[np.bool_]) -> None:
-        """Look at sites in the windows in which they are marked, [window, site], and in the last one; in all others
+        """Look at sites in the windows in which they are marked, [window, site], the last one left out; in all others
         they show what they do in the one before.
         """
         self.at(*np.nonzero(marked))
-        # the last window is the first of the next block
-        self._in_all([self._last])
         for window in range(1, self._last):
             self._keep(window, window - 1, ~marked[window])
 
     def every(self, stride: int, sites: Sites, wanted: Wanted | None) -> None:
-        """Look in every so many windows, and in the last one, then half way between two looks that differ, and so on.
+        """Look in every so many windows, then half way between two looks that differ, and so on, after `at_end`.
 
         Parameters
         ----------
@@ -71,7 +75,7 @@ class Looks:
         wanted : wanted error of each site; needed where `stride` is above 1.
         """
         looks = [*range(0, self._last, stride), self._last]
-        self._in_all(looks[1:])
+        self._in_all(looks[1:-1])
         spans = [span for span in pairwise(looks) if span[1] - span[0] > 1]
         while spans:
             windows, places = [], []

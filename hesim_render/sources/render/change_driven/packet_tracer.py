@@ -175,6 +175,7 @@ class PacketTracer(Tracer):
         footprint: Float,
         aims: PairAims | PairEdges | None,
         is_weighted: bool = True,
+        shadows: NDArray[np.uint32] | None = None,
     ) -> _Traced:
         """Trace pairs in packets of `PACKET` rays.
 
@@ -186,10 +187,38 @@ class PacketTracer(Tracer):
         packets, half_rays : number of packets of each pair, and of rays in its first half.
         moments, key, footprint, aims : see `trace` and `pilot`.
         is_weighted : take the model from the fluxes of pairs with an edge, and apply the weights of rays.
+        shadows : of each pair, see `DiffuseIntegrator.flux`; None for none.
 
         Returns
         -------
         Of each ray.
+        """
+        rays, pair = self._started(lanes, packets, half_rays, moments, key, footprint, aims)
+        types, now = jit(), rays.now
+        hidden = () if shadows is None else (spread_out(types.UInt32, shadows, pair),)
+        dr.eval(*hidden)
+        *fluxes, met = self._integrator.flux(self._sampler, rays.ray, now, rays.filter, *hidden)
+        bits = dr.select(met, types.UInt32(1), dr.zeros(types.UInt32, int(packets.sum()) * PACKET))
+        dr.eval(fluxes, bits)
+        self._sampler.rest()
+        if rays.weight is not None and is_weighted:
+            model = 0 if rays.model is None else rays.model
+            fluxes = [(flux - model) * rays.weight for flux in fluxes]
+            dr.eval(fluxes)
+        return _Traced((fluxes[0], fluxes[1], fluxes[2], bits), rays.place, rays.share)
+
+    def _started(
+        self,
+        lanes: Sequence[NDArray[np.uint32]],
+        packets: NDArray[np.int64],
+        half_rays: NDArray[np.int64],
+        moments: Moments,
+        key: UInt64,
+        footprint: Float,
+        aims: PairAims | PairEdges | None,
+    ) -> tuple[_Rays, UInt32]:
+        """Rays of pairs, before they are traced, and the pair of each; see `_packets_of`. The sampler has drawn the
+        numbers of their starts.
         """
         types = jit()
         used = int(packets.sum())
@@ -230,15 +259,7 @@ class PacketTracer(Tracer):
             rays.weight,
             rays.model,
         )
-        *fluxes, met = self._integrator.flux(self._sampler, rays.ray, now, rays.filter)
-        bits = dr.select(met, types.UInt32(1), dr.zeros(types.UInt32, used * PACKET))
-        dr.eval(fluxes, bits)
-        self._sampler.rest()
-        if rays.weight is not None and is_weighted:
-            model = 0 if rays.model is None else rays.model
-            fluxes = [(flux - model) * rays.weight for flux in fluxes]
-            dr.eval(fluxes)
-        return _Traced((fluxes[0], fluxes[1], fluxes[2], bits), rays.place, rays.share)
+        return rays, pair
 
     def _keys_of(self, key: UInt64, heads: UInt32, repeat: NDArray[np.uint32], kinds: int) -> UInt32:
         """Keys of the random numbers of each pair and kind of ray, four numbers each: once for all rays of a kind.

@@ -1,7 +1,7 @@
 """Results of tracing pairs of a pixel and a window: flux, and the statistics of a pilot pass."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,10 @@ from hesim_render.sources.render.change_driven.aim import PairAims
 from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
 from hesim_render.sources.render.change_driven.ray_statistics import RayStatistics
 from hesim_render.sources.render.change_driven.windows import Windows
+
+#: What a pair shows, by `PilotFlux`, and how its rays differ from the same rays in another window.
+STATISTICS = ("controlled", "plain", "controlled_scatter", "plain_scatter", "unshadowed")
+CHANGES = ("controlled_change", "plain_change")
 
 
 @dataclass(frozen=True)
@@ -97,9 +101,18 @@ class PilotFlux:
         controlled, plain, unshadowed, *others = (np.zeros(count, np.float32) for _ in range(7))
         return cls(controlled, plain, unshadowed, others[0], others[1], np.zeros(count, np.bool_), others[2], others[3])
 
+    def with_means(self, place: NDArray[np.int64], others: PilotFlux, chosen: NDArray[np.bool_]) -> PilotFlux:
+        """The same, but for what some pairs show, which is that of those that are `chosen` among others; changes and
+        `met` stay.
+        """
+        tables = {name: getattr(self, name).copy() for name in STATISTICS}
+        for name, values in tables.items():
+            values[place] = getattr(others, name)[chosen]
+        return replace(self, **tables)
+
     def put(
         self,
-        part: slice,
+        part: slice | NDArray[np.int64],
         controlled: Float,
         plain: Float,
         unshadowed: Float,

@@ -13,8 +13,9 @@ from hesim_render.core.device_types import Float, UInt64
 from hesim_render.core.rng import Stream
 from hesim_render.core.tables import spread_out
 from hesim_render.sources.render.change_driven.aim import PairAims, in_blocks
-from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges, joined_rays
-from hesim_render.sources.render.change_driven.packet_tracer import PACKET, PacketTracer, pair_of_rays
+from hesim_render.sources.render.change_driven.decision_rays import DecisionRays
+from hesim_render.sources.render.change_driven.edges import PairEdges
+from hesim_render.sources.render.change_driven.packet_tracer import PACKET, pair_of_rays
 from hesim_render.sources.render.change_driven.pair_flux import (
     PairFlux,
     PilotFlux,
@@ -26,7 +27,7 @@ from hesim_render.sources.render.change_driven.pair_flux import (
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
 
 
-class PairTracer(PacketTracer):
+class PairTracer(DecisionRays):
     """Flux and pilots of pairs; see `PacketTracer`."""
 
     def trace(
@@ -42,6 +43,7 @@ class PairTracer(PacketTracer):
         aims: PairAims | None = None,
         edges: PairEdges | None = None,
         signed: bool = False,
+        shadows: NDArray[np.uint32] | None = None,
     ) -> PairFlux:
         """Flux of every listed pair.
 
@@ -59,6 +61,8 @@ class PairTracer(PacketTracer):
         edges : models of edges, about which half of the rays start, where a pair has one; such a pair has 16 rays or
             more, so that each half has both kinds.
         signed : leave negative means as they are, for fluxes of which differences are taken.
+        shadows : [n], codes of `LampShadows`: these shadows are taken in closed form; 0, or None, for none. They are
+            a control variate, whatever `controlled` says.
 
         Returns
         -------
@@ -68,10 +72,14 @@ class PairTracer(PacketTracer):
         packets = (samples // PACKET).astype(np.int64)
         moments = self._moments(windows, span_us)
         key, times = self._key(stream), np.broadcast_to(np.asarray(repeat, np.uint32), pixel.shape)
-        for part, aimed in in_blocks(packets, self._block_rays // PACKET, aims, edges):
+        if shadows is not None:
+            controlled = controlled | (shadows > 0)
+        for part, aimed, known in in_blocks(packets, self._block_rays // PACKET, aims, edges, shadows):
             lanes = pixel[part], window[part].astype(np.uint32), times[part]
-            inputs = "flux", *lanes, controlled[part], packets[part], stream, *flux_inputs(windows, span_us, aimed)
-            trace = partial(self._trace_block, lanes, controlled[part], packets[part], moments, key, aimed, out, part)
+            others = *flux_inputs(windows, span_us, aimed), known
+            inputs = "flux", *lanes, controlled[part], packets[part], stream, *others
+            given = lanes, controlled[part], packets[part], moments, key, aimed, known, out, part
+            trace = partial(self._trace_block, *given)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report(int(packets[part].sum()) * PACKET)
         if edges is not None:
@@ -100,6 +108,7 @@ class PairTracer(PacketTracer):
         kept: Sequence[Float] | None = None,
         repeat: int = 0,
         mild: bool = False,
+        shadows: NDArray[np.uint32] | None = None,
     ) -> PilotFlux:
         """Statistics of a few rays of every listed pair, with random numbers of their own.
 
@@ -117,19 +126,17 @@ class PairTracer(PacketTracer):
             axis. They are large, so the journal keeps nothing of such a pass.
         repeat : number of the set of random numbers.
         mild : take the mild scatter, see `PilotFlux`.
+        shadows : see `trace`; no pair has any where rays are kept.
 
         Returns
         -------
         Statistics of the pairs, [n].
         """
-        count, out = pixel.size, PilotFlux.empty(pixel.size)
+        out, packets = PilotFlux.empty(pixel.size), np.full(pixel.size, samples // PACKET)
         moments, key = self._moments(windows, span_us), self._key(stream)
         footprint = dr.opaque(jit().Float, footprint_px)
-        room = max(1, self._block_rays // samples)
-        for first in range(0, count, room):
-            part = slice(first, min(count, first + room))
-            lanes = pixel[part], window[part].astype(np.uint32), np.full(part.stop - first, repeat, np.uint32)
-            aimed = None if aims is None else aims.part(part)
+        for part, aimed, known in in_blocks(packets, self._block_rays // PACKET, aims, None, shadows):
+            lanes = pixel[part], window[part].astype(np.uint32), np.full(pixel[part].size, repeat, np.uint32)
             compared = None if before is None else (before[0], before[1][part])
             others = () if compared is None else (compared[0].spans_us, compared[1])
             inputs = (
@@ -141,12 +148,12 @@ class PairTracer(PacketTracer):
                 mild,
                 *flux_inputs(windows, span_us, aimed),
                 *others,
+                known,
             )
-            trace = partial(
-                self._pilot_block, lanes, moments, key, samples, footprint, aimed, out, part, compared, kept, mild
-            )
+            given = lanes, moments, key, samples, footprint, aimed, known, out, part, compared, kept, mild
+            trace = partial(self._pilot_block, *given)
             remembered(self._journal if kept is None else None, self._run_part + inputs, out, part, trace)
-            self._report((part.stop - first) * samples)
+            self._report(lanes[0].size * samples)
         scale = self.axis_factor(pixel)
         for each in fields(out):
             if each.name != "met":
@@ -171,103 +178,6 @@ class PairTracer(PacketTracer):
         spans_us = *windows.begin_us[used].tolist(), *windows.end_us[used].tolist()
         return out, PilotRays(kept[0], kept[1], samples, spans_us)
 
-    def edges(
-        self,
-        pixel: NDArray[np.uint32],
-        window: NDArray[np.integer],
-        windows: Windows,
-        samples: int,
-        footprint_px: float,
-        controlled: NDArray[np.bool_],
-        least: NDArray[np.float32],
-        stream: Stream = Stream.RENDER_EDGE,
-        moves: bool = False,
-    ) -> EdgeFit:
-        """Lines fitted to a few rays of every listed pair, with random numbers of their own.
-
-        Parameters
-        ----------
-        pixel, window, windows, controlled, stream : see `trace`.
-        samples : rays per pair, a power of two, at least twice `LEAST_SAMPLES`; half as many where the first half shows
-            little contrast, and twice as many where there is a line.
-        footprint_px : width of the area in which these rays start, pixels.
-        least : [n], contrast below which it is little, e⁻/s on the optical axis.
-        moves : True where lines may move within the windows.
-
-        Returns
-        -------
-        Fits of the pairs, [n].
-        """
-        out, moments, key = EdgeFit.empty(pixel.size), self._moments(windows, None), self._key(stream)
-        footprint, room = dr.opaque(jit().Float, footprint_px), max(1, self._block_rays // samples)
-        for first in range(0, pixel.size, room):
-            part = slice(first, min(pixel.size, first + room))
-            lanes = pixel[part], window[part].astype(np.uint32), np.zeros(part.stop - first, np.uint32)
-            inputs = (
-                "edges",
-                *lanes,
-                controlled[part],
-                least[part],
-                samples,
-                footprint_px,
-                stream,
-                moves,
-                *flux_inputs(windows, None, None),
-            )
-            given = lanes, controlled[part], least[part], moments, key, samples, footprint, out, part, moves
-            trace = partial(self._edge_block, *given)
-            remembered(self._journal, self._run_part + inputs, out, part, trace)
-            self._report(int(out.rays[part].sum(dtype=np.int64)))
-        return out
-
-    def _edge_block(
-        self,
-        lanes: Sequence[NDArray[np.uint32]],
-        controlled: NDArray[np.bool_],
-        least: NDArray[np.float32],
-        moments: Moments,
-        key: UInt64,
-        samples: int,
-        footprint: Float,
-        out: EdgeFit,
-        part: slice,
-        moves: bool,
-    ) -> None:
-        """Lines of some pairs: of rays all over the pixel, as many more where these show contrast, and twice as many
-        about a line, where there is one.
-        """
-
-        def decision_rays(
-            some: NDArray[np.int64], rays: int, repeat: int, about: PairEdges | None = None
-        ) -> list[Float]:
-            """Place, time and flux of the rays of some pairs."""
-            packets = np.full(some.size, rays // PACKET)
-            chosen = [values[some] for values in lanes[:2]] + [np.full(some.size, repeat, np.uint32)]
-            width = footprint if about is None else dr.opaque(jit().Float, 1.0)
-            traced = self._packets_of(chosen, packets, packets * PACKET, moments, key, width, about, is_weighted=False)
-            types = jit()
-            by_control = spread_out(types.UInt32, controlled[some].astype(np.uint32), pair_of_rays(packets))
-            values = [*traced.place, traced.share - 0.5, dr.select(by_control != 0, traced.fluxes[0], traced.fluxes[1])]
-            dr.eval(values)
-            return values
-
-        every, half = np.arange(lanes[0].size), samples // 2
-        first, fit = decision_rays(every, half, 0), EdgeFit.empty(every.size)
-        fit.put(slice(None), first, half, moves)
-        uneven = np.flatnonzero(fit.high - fit.low >= least)
-        if uneven.size:
-            both = joined_rays(first, uneven, decision_rays(uneven, half, 1), half)
-            better = EdgeFit.empty(uneven.size)
-            better.put(slice(None), both, samples, moves)
-            lines = np.flatnonzero(better.is_line)
-            if lines.size:
-                refined = EdgeFit.empty(lines.size)
-                more = decision_rays(uneven[lines], samples, 2, better.models(lines, wider=True))
-                refined.put(slice(None), joined_rays(both, lines, more, samples), 2 * samples, moves)
-                better.replace(lines, refined)
-            fit.replace(uneven, better)
-        out.replace(part, fit)
-
     def _trace_block(
         self,
         lanes: Sequence[NDArray[np.uint32]],
@@ -276,6 +186,7 @@ class PairTracer(PacketTracer):
         moments: Moments,
         key: UInt64,
         aims: PairAims | PairEdges | None,
+        shadows: NDArray[np.uint32] | None,
         out: PairFlux,
         part: slice | NDArray[np.int64],
     ) -> None:
@@ -284,7 +195,7 @@ class PairTracer(PacketTracer):
         rays = packets * PACKET
         footprint = dr.opaque(types.Float, 1.0)
         controlled_flux, plain_flux, _, met = self._packets_of(
-            lanes, packets, rays // 2, moments, key, footprint, aims
+            lanes, packets, rays // 2, moments, key, footprint, aims, shadows=shadows
         ).fluxes
         is_controlled = spread_out(types.UInt32, controlled.astype(np.uint32), pair_of_rays(packets))
         out.put(part, dr.select(is_controlled != 0, controlled_flux, plain_flux), met, packets, PACKET)
@@ -296,9 +207,10 @@ class PairTracer(PacketTracer):
         key: UInt64,
         samples: int,
         footprint: Float,
-        aims: PairAims | None,
+        aims: PairAims | PairEdges | None,
+        shadows: NDArray[np.uint32] | None,
         out: PilotFlux,
-        part: slice,
+        part: slice | NDArray[np.int64],
         before: tuple[PilotRays, NDArray[np.integer]] | None,
         kept: Sequence[Float] | None,
         mild: bool,
@@ -306,10 +218,11 @@ class PairTracer(PacketTracer):
         """Statistics of some pairs, each with the same number of rays, and their single rays where they are kept."""
         packets = np.full(lanes[0].size, samples // PACKET)
         # all rays belong to the first half
-        traced = self._packets_of(lanes, packets, packets * PACKET, moments, key, footprint, aims).fluxes
+        given = lanes, packets, packets * PACKET, moments, key, footprint, aims
+        traced = self._packets_of(*given, shadows=shadows).fluxes
         # rays that are aimed are a kind of their own: their mean differs from that of the others
         out.put(part, *traced, samples, samples if aims is None else samples // 2, before, mild)
-        if kept is not None:
+        if kept is not None and isinstance(part, slice):
             types = jit()
             place = dr.opaque(types.UInt32, part.start * samples) + dr.arange(types.UInt32, len(traced[0]))
             for values, flux in zip(kept, traced[:2], strict=True):

@@ -20,9 +20,10 @@ from hesim_render.sources.render.change_driven.change_detector import (
     windows_with_changes,
 )
 from hesim_render.sources.render.change_driven.deep_shadow import DeepShadow
-from hesim_render.sources.render.change_driven.looks import CHANGES, STATISTICS, Looks
+from hesim_render.sources.render.change_driven.known_shadows import with_known_shadows
+from hesim_render.sources.render.change_driven.looks import Looks
 from hesim_render.sources.render.change_driven.neighbours import Sites
-from hesim_render.sources.render.change_driven.pair_flux import PilotFlux, PilotRays, joined
+from hesim_render.sources.render.change_driven.pair_flux import CHANGES, STATISTICS, PilotFlux, PilotRays, joined
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.small_objects import Look
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -101,6 +102,7 @@ class Pilot:
     change : differences to other windows; None where nothing is compared.
     all_move : True if the camera moves, and with it every edge in the image.
     deep : sites in deep shadow; None if there are none.
+    shadows : [window, site], known shadows, see `PairTracer.trace`; None if there are none.
     """
 
     controlled: NDArray[np.float32]
@@ -113,6 +115,7 @@ class Pilot:
     change: Change | None = None
     all_move: bool = False
     deep: DeepShadow | None = None
+    shadows: NDArray[np.uint32] | None = None
 
     @property
     def windows(self) -> int:
@@ -182,6 +185,9 @@ def take_pilot(
     else:
         before = anchored.rays, every
         first, own_rays = tracer.pilot_rays(sites.index, numbers[0], *given, span_us=span_us, before=before, mild=mild)
+    # known shadows [window, site]: shapes that hide light in the first window do so in those that follow
+    shadows, given_shadows = np.zeros((count, sites.size), np.uint32), (rays, width_px, wanted, mild)
+    first, shadows[:] = with_known_shadows(tracer, (sites.index, numbers[0], windows), first, *given_shadows)
     knows = tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
     near = first.met if knows else np.ones(sites.size, np.bool_)
 
@@ -190,14 +196,27 @@ def take_pilot(
         compared = None
         if anchored is not None and own_rays is not None:
             compared = joined(own_rays, anchored.rays), place + np.where(window == count - 1, sites.size, 0)
-        return tracer.pilot(sites.index[place], numbers[window, place], *given, before=compared, mild=mild)
+        return tracer.pilot(
+            sites.index[place],
+            numbers[window, place],
+            *given,
+            before=compared,
+            mild=mild,
+            shadows=shadows[window, place],
+        )
 
     looks = Looks(first, count, near, look)
     if count > 1 and near.any():
+        # the last window is the first of the next block, whose shadows are its own
+        shadows[-1, near] = 0
+        pairs = sites.index, numbers[-1], windows
+        at_end, own = with_known_shadows(tracer, pairs, looks.at_end(), *given_shadows, among=near)
+        shadows[-1, near] = own[near]
+        looks.put(count - 1, at_end)
         if stride == 1 and rays > DETECTOR_RAYS and wanted is not None and count > 2:
             # few rays tell which windows show anything new
             of = tracer, sites, numbers, windows, first, near, wanted, width_px, mild
-            looks.wherever(windows_with_changes(*of))
+            looks.wherever(windows_with_changes(*of, shadows[0]))
         else:
             looks.every(stride, sites, wanted)
     tables = [looks.tables[name] for name in STATISTICS]
@@ -212,8 +231,9 @@ def take_pilot(
         change = Change(means[0], means[1], looks.tables[CHANGES[0]], looks.tables[CHANGES[1]])
     near_by = [(window, one) for window, row in enumerate(extra_looks) for one in row if one.place.size]
     aims = Aims.of([(window, *one.aims) for window, one in near_by if one.aims is not None], sites.size)
-    refined = _refine(tracer, sites, windows, numbers, pilot, width_px, near_by, aims)
-    return replace(pilot, refined=refined, aims=aims, change=change, all_move=tracer.camera is not None), near
+    refined = _refine(tracer, sites, windows, numbers, pilot, width_px, near_by, aims, shadows)
+    moves = tracer.camera is not None
+    return replace(pilot, refined=refined, aims=aims, change=change, all_move=moves, shadows=shadows), near
 
 
 def _is_window(span_us: tuple[float, float], windows: Windows, numbers: NDArray[np.int64]) -> bool:
@@ -231,6 +251,7 @@ def _refine(
     width_px: float,
     looks: Sequence[tuple[int, Look]],
     aims: Aims | None,
+    shadows: NDArray[np.uint32],
 ) -> list[Refinement]:
     """Trace extra pilot rays, listed with their windows. Results for large objects, and those of aimed rays, replace
     those of the pilot; results for small objects are returned.
@@ -250,7 +271,9 @@ def _refine(
         own_aims = aims.at(window, place) if is_aimed and aims is not None else None
         width = 1.0 if is_aimed else width_px
         refined = tracer.pilot(
-            *(sites.index[place], numbers[window, place], windows, rays, width, Stream.RENDER_ZOOM), aims=own_aims
+            *(sites.index[place], numbers[window, place], windows, rays, width, Stream.RENDER_ZOOM),
+            aims=own_aims,
+            shadows=shadows[window, place],
         )
         if is_aimed or not is_small:
             for values, new in zip(_tables(pilot), _tables(refined), strict=True):

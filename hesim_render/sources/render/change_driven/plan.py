@@ -73,6 +73,7 @@ class Plan:
     asked : rendered pairs that show no change by themselves, for which neighbours ask; none where no edge is followed.
     pilot : flux of the pilot, e⁻/s.
     aims : small objects at which rays are aimed, by window and site; None if there are none.
+    shadows : [window, pixel], known shadows, see `PairTracer.trace`; None if there are none.
     """
 
     rendered: NDArray[np.bool_]
@@ -87,6 +88,7 @@ class Plan:
     asked: NDArray[np.bool_]
     pilot: NDArray[np.float32]
     aims: Aims | None = None
+    shadows: NDArray[np.uint32] | None = None
 
     def until(self, window: int) -> "Plan":
         """The plan without the pairs on which no value up to a window depends.
@@ -116,7 +118,8 @@ class Plan:
         """The plan of the first window alone."""
         names = "rendered", "rays", "controlled", "error", "wanted", "floor", "fitted", "barred", "asked", "pilot"
         first = {name: getattr(self, name)[:1] for name in names}
-        return replace(self, differences=self.differences.first(), **first)
+        shadows = None if self.shadows is None else self.shadows[:1]
+        return replace(self, differences=self.differences.first(), shadows=shadows, **first)
 
 
 def plan(
@@ -162,6 +165,7 @@ def plan(
         np.zeros(shape, np.bool_),
         pilot.steady_flux[:, sites.listed],
         pilot.aims,
+        None if pilot.shadows is None else pilot.shadows[:, sites.listed],
     )
     if last > 1:
         # what must change, at least, for a window to be rendered, [window, site]

@@ -12,6 +12,7 @@ from hesim_render.sources.render.change_driven.aim import Aims, PairAims
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
 from hesim_render.sources.render.change_driven.edges import PairEdges
 from hesim_render.sources.render.change_driven.error_target import NoiseUnit
+from hesim_render.sources.render.change_driven.known_shadows import with_known_shadows
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.small_objects import Zoom
@@ -115,17 +116,27 @@ def traced_again(
     windows = Windows(span[0], span[1])
     aims = _aims(zoom, pixel, tracer.sensor.spec.geometry.cols, windows, window)
     pilot = _pilot(tracer, pixel, windows, window, tuning.audit_pilot_rays, aims)
+    # known shadows, as in the run
+    own_unit = unit_of(pixel)
+
+    def wanted_of(flux: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.float32(quality) * own_unit(flux)
+
+    listed, alone = (pixel, window, windows), None if aims is None else aims.count == 0
+    given = tracer, listed, pilot, tuning.audit_pilot_rays, 1.0, wanted_of
+    pilot, shadows = with_known_shadows(*given, stream=Stream.AUDIT_PILOT, among=alone)
     # the estimator with less scatter, as in the run, by a pilot of its own
     controlled = (pilot.controlled_scatter <= pilot.plain_scatter) & (2 * pilot.controlled >= pilot.unshadowed)
     flux = np.where(controlled, pilot.controlled, pilot.plain)
     scatter = np.where(controlled, pilot.controlled_scatter, pilot.plain_scatter)
     # rays for the wanted error of the scatter, and so many that no ray weighs too much
-    own_unit = unit_of(pixel)
-    wanted_error = np.float32(quality) * own_unit(flux)
-    wanted = np.maximum(
-        gain.rays(scatter / wanted_error), pilot.unshadowed / (np.float32(tuning.audit_ray_weight) * wanted_error)
-    )
-    rays = 1 << np.ceil(np.log2(np.clip(wanted, tuning.least_audit_rays, tuning.most_rays))).astype(np.int64)
+    wanted_error = wanted_of(flux)
+    by_scatter = gain.rays((scatter / wanted_error).astype(np.float32))
+    by_weight = pilot.unshadowed / (np.float32(tuning.audit_ray_weight) * wanted_error)
+    # powers of two, of the weight of a ray the nearest one
+    wanted = np.maximum(np.ceil(np.log2(np.maximum(by_scatter, 1))), np.rint(np.log2(np.maximum(by_weight, 1))))
+    bits = np.clip(wanted, np.log2(tuning.least_audit_rays), np.log2(tuning.most_rays))
+    rays: NDArray[np.integer] = 1 << bits.astype(np.int64)
     # where the largest number of rays does not do, the pair is traced several times
     wanted_times = np.ceil((gain.error(scatter, rays) / wanted_error) ** 2)
     edges: PairEdges | None = None
@@ -136,8 +147,8 @@ def traced_again(
         if aims is not None:
             tried &= aims.count == 0
         rays, edges = about_edges(
-            *(tracer, (pixel, window, windows), law, controlled, wanted_error, floor, gain, tuning),
-            tried=tried, flat_part=1.0, stream=Stream.AUDIT_EDGE,
+            *(tracer, listed, law, controlled, wanted_error, floor, gain, tuning),
+            tried=tried, flat_part=1.0, shadows=shadows, stream=Stream.AUDIT_EDGE,
         )  # fmt: skip
         wanted_times = np.where(rays < law, 1, wanted_times)
     times = np.clip(wanted_times, 1, tuning.most_audit_times).astype(np.int64)
@@ -147,7 +158,7 @@ def traced_again(
     repeat = np.arange(each.size) - first[each]
     got = tracer.trace(
         *of, repeat=repeat, aims=None if aims is None else aims.part(each),
-        edges=None if edges is None else edges.part(each),
+        edges=None if edges is None else edges.part(each), shadows=shadows[each],
     )  # fmt: skip
     values = 0.5 * np.stack([got.half_a + got.half_b, got.half_a - got.half_b]).astype(np.float64)
     return (np.add.reduceat(values, first, axis=1) / times)[:, place.ravel()]

@@ -64,7 +64,7 @@ class Blockers:
         if select().backend == "cuda":
             return cls(mi, balls, rest=scene)
         boxes = {k: box for k, shape in enumerate(shapes) if (box := box_of(shape)) is not None}
-        faces = {k: face for k, shape in enumerate(shapes) if (face := _face_of(shape)) is not None}
+        faces = {k: face for k, shape in enumerate(shapes) if (face := face_of(shape)) is not None}
         if len(boxes) + len(faces) == len(shapes) <= _MOST:
             return cls(mi, balls, list(boxes.values()), list(faces.values()))
         # Mitsuba cannot put an instance into a second scene
@@ -116,7 +116,7 @@ def _triangles(shape: MitsubaObject) -> NDArray[np.float64]:
     return mesh_vertices(shape).astype(np.float64)[mesh_faces(shape)]
 
 
-def _face_of(shape: MitsubaObject) -> NDArray[np.float64] | None:
+def face_of(shape: MitsubaObject) -> NDArray[np.float64] | None:
     triangles = _triangles(shape)
     return map_of(*triangles) if len(triangles) == _OF_FACE else None
 

@@ -41,6 +41,7 @@ from hesim_render.sources.render.scene.surfaces import Paint
 from hesim_render.sources.render.transport.irradiance import RectangleLight
 from hesim_render.sources.render.transport.leaving import Leaving
 from hesim_render.sources.render.transport.moving_scene import MovingScene
+from hesim_render.sources.render.transport.occluded_lamps import SLOTS, LampShadows
 from hesim_render.sources.render.transport.outlines import OccludedSky
 from hesim_render.sources.render.transport.swept_boxes import Moment
 from hesim_render.specs.light import LightSpec, irradiance
@@ -97,6 +98,7 @@ class DiffuseIntegrator:
             strengths.append(sky.scaled(1 / pi))
         self._has_sky = bool(skies)
         self._outlines = OccludedSky(scene) if skies else None
+        self._shadows = LampShadows(scene) if lamp_of else None
         black = constant(0.0)
         colours: list[Spectrum] = [black]
         rows: dict[str, list[float]] = {}
@@ -140,7 +142,12 @@ class DiffuseIntegrator:
         self._filters, self._colours = mi.UInt32(len(responses)), mi.UInt32(len(colours))
 
     def flux(
-        self, sampler: MitsubaObject, ray: Ray, moment: Moment, filter_index: UInt32
+        self,
+        sampler: MitsubaObject,
+        ray: Ray,
+        moment: Moment,
+        filter_index: UInt32,
+        shadows: UInt32 | None = None,
     ) -> tuple[Float, Float, Float, Mask]:
         """Trace one ray per lane.
 
@@ -150,11 +157,12 @@ class DiffuseIntegrator:
         ray : Ray3f, world space.
         moment : time of each ray.
         filter_index : UInt32, filter of the ray's pixel.
+        shadows : UInt32, shapes whose shadows are taken in closed form, see `LampShadows.before`; None for none.
 
         Returns
         -------
-        controlled, plain : Float, both estimates of the flux, e⁻/s.
-        unshadowed : Float, the flux if nothing hid any light, e⁻/s.
+        controlled, plain : Float, both estimates of the flux, e⁻/s; with `shadows`, the controlled one twice.
+        unshadowed : Float, the flux if nothing hid any light but `shadows` of a single shape, e⁻/s.
         met : Bool, True where the path came through the box of a moving object.
         """
         mi, scene = self._scene.mi, self._scene
@@ -198,6 +206,12 @@ class DiffuseIntegrator:
                 asks,
             )
             known = open_
+            if shadows is not None and self._shadows is not None and isinstance(light, _Lamp):
+                of = normal, shadow, moment, dr.select(asks, shadows, 0)
+                part, hits = self._shadows.before(light.rectangle, *of)
+                known = dr.fma(share, hits, open_ - part * light.scale)
+                # where two shapes hide the same, a ray may bring more than is known to arrive
+                open_ = dr.select(shadows < 256, open_ - part * light.scale, open_)
             if self._outlines is not None and self._outlines.is_known and isinstance(light, _Sky):
                 # a share of the sky that is known to be hidden, and whether it hides this ray
                 part, hides = self._outlines.hides(surface.world.p, normal, shadow.d, moment)
@@ -205,15 +219,38 @@ class DiffuseIntegrator:
             controlled = dr.fma(scale, dr.select(blocked, known - share, known), controlled)
             plain = dr.fma(scale, dr.select(blocked, 0.0, share), plain)
             unshadowed = dr.fma(scale, open_, unshadowed)
-        return controlled, plain, unshadowed, met
+        # known shadows are known in all windows, so there is no choice
+        return controlled, plain if shadows is None else controlled, unshadowed, met
+
+    @property
+    def knows_shadows(self) -> bool:
+        """True if there are shapes whose shadows have a closed form."""
+        return self._shadows is not None and self._shadows.is_known
+
+    def shadows_of(self, sampler: MitsubaObject, ray: Ray, moment: Moment) -> UInt32:
+        """Shapes that hide lamps from what a ray of each lane hits: eight bits for each of the first lamps, see
+        `LampShadows.first_met`.
+        """
+        mi, scene = self._scene.mi, self._scene
+        assert self._shadows is not None
+        surface = scene.intersect(ray, moment, True, mi.Bool(True), mi.RayFlags.Minimal)
+        hit = surface.rest.is_valid()
+        normal = mi.Vector3f(surface.world.n)
+        normal = dr.select(dr.dot(normal, ray.d) < 0, normal, -normal)
+        code = mi.UInt32(0)
+        lamps = [light for light in self._lights if isinstance(light, _Lamp)]
+        for number, lamp in enumerate(lamps[:SLOTS]):
+            open_, _, shadow = lamp.seen_from(surface.world, normal, sampler)
+            code |= self._shadows.first_met(shadow, moment, hit & (open_ > 0)) << (8 * number)
+        return code
 
 
 class _Lamp:
     """A rectangle light; its strength is its radiance."""
 
     def __init__(self, leaving: Leaving, frame: NDArray[np.float64], geometry: float) -> None:
-        self._rectangle, self._leaving = RectangleLight(leaving.mi, frame), leaving
-        self._scale = dr.opaque(leaving.mi.Float, 1 / geometry)
+        self.rectangle, self._leaving = RectangleLight(leaving.mi, frame), leaving
+        self.scale = dr.opaque(leaving.mi.Float, 1 / geometry)
 
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
         """e_k and r at surface points, and the shadow ray to the point drawn on the light.
@@ -224,9 +261,9 @@ class _Lamp:
         normal : unit Vector3f, on the visible side.
         sampler : random numbers.
         """
-        drawn, share = self._rectangle.sample(point.p, normal, sampler.next_2d())
+        drawn, share = self.rectangle.sample(point.p, normal, sampler.next_2d())
         shadow = self._leaving.to(point, drawn)
-        return self._rectangle.irradiance(point.p, normal) * self._scale, share * self._scale, shadow
+        return self.rectangle.irradiance(point.p, normal) * self.scale, share * self.scale, shadow
 
 
 class _Point:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.device import dr
-from hesim_render.core.device_types import Float, MitsubaModule, Point2, Point3, Vector3
+from hesim_render.core.device_types import Float, Mask, MitsubaModule, Point2, Point3, Vector3
 
 #: Area over squared distance below which a rectangle counts as a point at its centre: the sum over edges loses its
 #: digits in float32 there, and the relative error of the point is about as large as this number.
@@ -26,12 +26,12 @@ class RectangleLight:
         self._mi = mi
         vectors = [mi.Vector3f(frame[:3, k]) for k in range(4)]
         corners = [frame[:3, 3] + a * frame[:3, 0] + b * frame[:3, 1] for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-        self._half_width, self._half_height, self._normal, middle = vectors
-        self._middle = mi.Point3f(middle)
+        self._half_width, self._half_height, self.normal, middle = vectors
+        self.middle = mi.Point3f(middle)
         self._corners = [mi.Point3f(corner) for corner in corners]
         area = 4 * float((frame[:3, 0] ** 2).sum() ** 0.5 * (frame[:3, 1] ** 2).sum() ** 0.5)
         self._area_m2 = mi.Float(area)
-        dr.make_opaque(self._half_width, self._half_height, self._normal, self._middle, self._corners, self._area_m2)
+        dr.make_opaque(self._half_width, self._half_height, self.normal, self.middle, self._corners, self._area_m2)
 
     def irradiance(self, point: Point3, normal: Vector3) -> Float:
         """∫ cos θ dω over the part of the rectangle above the horizon, sr.
@@ -46,12 +46,36 @@ class RectangleLight:
         mi = self._mi
         rays = [corner - point for corner in self._corners]
         total = outline_above_horizon(mi, rays, normal)
-        to = self._middle - point
+        to = self.middle - point
         square = dr.squared_norm(to)
-        before = -dr.dot(to, self._normal)
+        before = -dr.dot(to, self.normal)
         as_point = self._area_m2 * before * dr.dot(to, normal) / (square * square)
         exact = dr.select(self._area_m2 < _SMALL_SR * square, dr.maximum(as_point, 0.0), 0.5 * abs(total))
         return dr.select(before > 0, exact, 0.0)
+
+    def outline(self, point: Point3, normal: Vector3) -> tuple[list[Vector3], list[Vector3], list[Float], Mask]:
+        """The rectangle as points see it from its front.
+
+        Parameters
+        ----------
+        point, normal : see `irradiance`.
+
+        Returns
+        -------
+        rays : from the point to each corner, in order.
+        planes : through the point and each edge, as normals that point inwards, as long as the cross product of their
+            ends.
+        weights : cosine of each of these normals to that of the surface.
+        is_clear : True where `irradiance` is that of all of the rectangle and not of a point in its centre.
+        """
+        rays = [corner - point for corner in self._corners]
+        planes = [dr.cross(other, one) for one, other in zip(rays, [*rays[1:], rays[0]], strict=True)]
+        weights = [dr.dot(plane, normal) * dr.rsqrt(dr.squared_norm(plane)) for plane in planes]
+        to = self.middle - point
+        is_clear = (dr.dot(to, self.normal) < 0) & (self._area_m2 >= _SMALL_SR * dr.squared_norm(to))
+        for ray in rays:
+            is_clear &= dr.dot(ray, normal) > 0
+        return rays, planes, weights, is_clear
 
     def sample(self, point: Point3, normal: Vector3, place: Point2) -> tuple[Point3, Float]:
         """A point drawn uniformly on the rectangle, and its contribution to the irradiance, whose mean is `irradiance`.
@@ -61,10 +85,10 @@ class RectangleLight:
         point, normal : see `irradiance`.
         place : Point2f in [0, 1)², random numbers.
         """
-        drawn = dr.fma(self._half_width, 2 * place.x - 1, dr.fma(self._half_height, 2 * place.y - 1, self._middle))
+        drawn = dr.fma(self._half_width, 2 * place.x - 1, dr.fma(self._half_height, 2 * place.y - 1, self.middle))
         to = drawn - point
         square = dr.squared_norm(to)
-        cosines = dr.maximum(dr.dot(to, normal), 0.0) * dr.maximum(-dr.dot(to, self._normal), 0.0)
+        cosines = dr.maximum(dr.dot(to, normal), 0.0) * dr.maximum(-dr.dot(to, self.normal), 0.0)
         return drawn, dr.select(square > 0, self._area_m2 * cosines / (square * square), 0.0)
 
 

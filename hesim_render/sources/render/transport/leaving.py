@@ -4,8 +4,6 @@ Mitsuba takes 9e-5 of 1 m and of the largest coordinate together, as for scenes 
 a tenth of it: shadows would begin beside the objects that cast them. Smaller scenes have a gap of their own size here.
 """
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np
