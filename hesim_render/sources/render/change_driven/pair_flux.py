@@ -101,7 +101,7 @@ class PilotFlux:
         controlled, plain, unshadowed, *others = (np.zeros(count, np.float32) for _ in range(7))
         return cls(controlled, plain, unshadowed, others[0], others[1], np.zeros(count, np.bool_), others[2], others[3])
 
-    def with_means(self, place: NDArray[np.int64], others: PilotFlux, chosen: NDArray[np.bool_]) -> PilotFlux:
+    def with_means(self, place: NDArray[np.int64], others: "PilotFlux", chosen: NDArray[np.bool_]) -> "PilotFlux":
         """The same, but for what some pairs show, which is that of those that are `chosen` among others; changes and
         `met` stay.
         """
