@@ -168,7 +168,8 @@ def read(path: Path) -> Iterator[NDArray]:
     """
     with reading(path, "as events"), h5py.File(path, "r") as file:
         stored = _records(file, EVENTS, "xypt", path)
-        count, chunk = stored.shape[0], _chunk_of(stored)
+        count = int(stored.shape[0])
+        chunk = int(stored.chunks[0]) if stored.chunks else max(1, min(count, 1 << 20))
         is_packed = _is_packed(stored)
         if is_packed and chunk > ecf.MOST_EVENTS:
             raise SpecError(f"{EVENTS} has chunks of {chunk} events; ECF has at most {ecf.MOST_EVENTS}", file=path)
@@ -230,10 +231,6 @@ def _records(file: Any, name: str, fields: Any, path: Path) -> Any:
     if not is_whole(stored):
         raise SpecError(f"{name} holds fewer records than the {stored.shape[0]} it says", file=path)
     return stored
-
-
-def _chunk_of(stored: Any) -> int:
-    return int(stored.chunks[0]) if stored.chunks else max(1, min(int(stored.shape[0]), 1 << 20))
 
 
 def _is_packed(stored: Any) -> bool:

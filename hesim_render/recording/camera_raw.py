@@ -5,6 +5,7 @@ RAW frames of one file each: PNG, TIFF, DNG, NPY and npz, without a sensor file.
 
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,9 @@ from hesim_render.core.errors import HesimWarning, SpecError, how_to_install
 from hesim_render.core.guard import printable, reading, require_memory, require_picture, require_plain
 from hesim_render.core.npz import read_array, read_arrays
 from hesim_render.recording.dng import read_dng
-from hesim_render.sensor.sensor import Sensor
+
+if TYPE_CHECKING:
+    from hesim_render.sensor.sensor import Sensor
 
 #: Suffixes of files that are read so; DNG and TIFF only where they are packed.
 CAMERA_SUFFIXES = (
@@ -28,7 +31,7 @@ _PIXEL_BYTES = 8
 _NEAR_DN = 1.0
 
 
-def read_camera_raw(file: Path, sensor: Sensor) -> NDArray[np.uint16]:
+def read_camera_raw(file: Path, sensor: "Sensor") -> NDArray[np.uint16]:
     """The visible part of the mosaic, [row, col], DN, with the black level in it.
 
     Parameters
@@ -71,7 +74,7 @@ def read_camera_raw(file: Path, sensor: Sensor) -> NDArray[np.uint16]:
         return visible.astype(np.uint16)
 
 
-def _check_colours(colours: NDArray[np.uint8], names: str, sensor: Sensor, file: Path) -> None:
+def _check_colours(colours: NDArray[np.uint8], names: str, sensor: "Sensor", file: Path) -> None:
     """Refuse a file whose first tile has other colours than the sensor."""
     from hesim_render.mosaic.description import describe
 
@@ -87,7 +90,7 @@ def _check_colours(colours: NDArray[np.uint8], names: str, sensor: Sensor, file:
         )
 
 
-def _tell_level(levels: NDArray[np.float64], sensor: Sensor, file: Path) -> None:
+def _tell_level(levels: NDArray[np.float64], sensor: "Sensor", file: Path) -> None:
     """Warn where the file states another black level."""
     aps = sensor.spec.aps
     if aps is not None and levels.size and abs(levels.mean() - aps.black_level_dn) > _NEAR_DN:

@@ -15,7 +15,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import printable, reading
 from hesim_render.mosaic.description import Mosaic
-from hesim_render.sensor.sensor import Sensor
+
+if TYPE_CHECKING:
+    from hesim_render.sensor.sensor import Sensor
 
 PHOTOMETRIC_CFA = 32803
 PHOTOMETRIC_LINEAR_RAW = 34892
@@ -288,7 +290,7 @@ def _rationals(values: NDArray[np.float64]) -> tuple[int, ...]:
 _SIGNALS = 65
 
 
-def noise_profile(sensor: Sensor, without: Sequence[str] = ()) -> tuple[float, float] | None:
+def noise_profile(sensor: "Sensor", without: Sequence[str] = ()) -> tuple[float, float] | None:
     """S and O of the temporal variance S·x + O of a pixel, where x is 0 at the black level and 1 at the white level.
 
     The law of the frame noise is fitted by least squares, each signal relative to its own variance, so that dark and

@@ -33,9 +33,11 @@ def geometry_of(manifest: Mapping[str, Any], folder: Path | None, scene: Scene |
     section = manifest["scene"]
     if section is None:
         raise SpecError("the recording was made from a video, which has no geometry", file=file)
+    # classes, which no ray sees, may be others than those of the recording
+    labels = {"labels": (section["spec"] or {}).get("labels", {})}
     if scene is None:
         scene = scene_of(section, file, "recording.truth_with(load_scene(PATH))")
-    elif content_hash(_as_labelled(scene.spec, section)) != section["sha256"]:
+    elif content_hash(scene.spec.model_copy(update=labels)) != section["sha256"]:
         raise SpecError(
             f"scene {scene.name!r} is not the one of the recording, {section['name']!r}, or was changed since",
             file=file,
@@ -44,11 +46,6 @@ def geometry_of(manifest: Mapping[str, Any], folder: Path | None, scene: Scene |
     layout = Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"])
     sensor = Sensor(layout, Lens.of(spec)).without(manifests.lens_terms_off(manifest))
     return SceneTruth(scene, sensor)
-
-
-def _as_labelled(spec: SceneSpec, section: Mapping[str, Any]) -> SceneSpec:
-    """The content of a scene with the classes of a manifest, which no ray sees."""
-    return spec.model_copy(update={"labels": (section["spec"] or {}).get("labels", {})})
 
 
 def scene_of(section: Mapping[str, Any], file: Path | None, remedy: str) -> Scene:

@@ -5,7 +5,7 @@ import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ValidationError
 
@@ -14,12 +14,14 @@ from hesim_render.core.guard import WholeFile, inside
 from hesim_render.mosaic import description as mosaic
 from hesim_render.recording.dng import noise_profile
 from hesim_render.recording.manifest_spec import RecordingSpec
-from hesim_render.sensor.sensor import Sensor
 from hesim_render.specs.files import Model, content_hash, validate
 from hesim_render.specs.lens import LENS_TERMS
 from hesim_render.specs.light import mixed_light
 from hesim_render.specs.reflectance import TextureSpec, leaves_of
 from hesim_render.specs.sensor import SensorSpec
+
+if TYPE_CHECKING:
+    from hesim_render.sensor.sensor import Sensor
 
 MANIFEST_NAME = "recording.json"
 SCHEMA_VERSION = 1
@@ -46,7 +48,7 @@ MASKS = {
 
 
 def build(
-    sensor: Sensor,
+    sensor: "Sensor",
     *,
     scene: BaseModel | None,
     seed: int,

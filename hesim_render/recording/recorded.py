@@ -15,7 +15,7 @@ Frames are written as they come and read back one at a time: a long recording is
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +24,16 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside
 from hesim_render.exchange.dsec import read_events, read_numbered_events
 from hesim_render.mosaic.description import Mosaic
-from hesim_render.pixels.evs.events import EVENT_DTYPE, LABELLED_DTYPE, EventLabels, no_events
+from hesim_render.pixels.evs.events import EVENT_DTYPE, LABELLED_DTYPE, no_events
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.frame import EventTruth, Frame, StoredFrames, read_frame_maps
-from hesim_render.recording.geometry import geometry_of
 from hesim_render.recording.label_file import LABEL_FILE, OBJECT_FILE, read_causes, read_labels, read_objects
-from hesim_render.recording.truth_file import TRUTH_FILE, StoredTruth
-from hesim_render.sources.render.truth.scene_truth import SceneTruth
-from hesim_render.sources.scene import Scene
+
+if TYPE_CHECKING:
+    from hesim_render.pixels.evs.events import EventLabels
+    from hesim_render.recording.truth_file import StoredTruth
+    from hesim_render.sources.render.truth.scene_truth import SceneTruth
+    from hesim_render.sources.scene import Scene
 
 
 class Recorded:
@@ -48,8 +50,8 @@ class Recorded:
         events: NDArray | None = None,
         event_truth: EventTruth | None = None,
         path: Path | None = None,
-        labels: EventLabels | None = None,
-        scene: Scene | None = None,
+        labels: "EventLabels | None" = None,
+        scene: "Scene | None" = None,
     ) -> None:
         self.frames, self.manifest, self.path, self.scene = frames, manifest, path, scene
         self._events, self._event_truth, self._labels = events, event_truth, labels
@@ -97,7 +99,7 @@ class Recorded:
         return self._event_truth
 
     @property
-    def event_labels(self) -> EventLabels | None:
+    def event_labels(self) -> "EventLabels | None":
         """What caused each event, lost events and the events without noise; None where the run was not asked for them.
 
         Raises
@@ -172,7 +174,7 @@ class Recorded:
         return result
 
     @cached_property
-    def truth(self) -> SceneTruth:
+    def truth(self) -> "SceneTruth":
         """Geometric truth at any time: depth, flow, poses and more, computed from the scene when it is asked for.
 
         Raises
@@ -182,7 +184,7 @@ class Recorded:
         """
         return self.truth_with(self.scene)
 
-    def truth_with(self, scene: Scene | None) -> SceneTruth:
+    def truth_with(self, scene: "Scene | None") -> "SceneTruth":
         """Geometric truth at any time, for a scene that needs files besides its own.
 
         Parameters
@@ -198,11 +200,15 @@ class Recorded:
         SpecError
             If it is another scene.
         """
+        from hesim_render.recording.geometry import geometry_of
+
         return geometry_of(self.manifest, self.path, scene)
 
     @cached_property
-    def stored_truth(self) -> StoredTruth | None:
+    def stored_truth(self) -> "StoredTruth | None":
         """Geometric truth that the run has written; None where it was not asked for, or the recording is in memory."""
+        from hesim_render.recording.truth_file import TRUTH_FILE, StoredTruth
+
         if self.path is None or not (self.path / TRUTH_FILE).is_file():
             return None
         return StoredTruth(inside(self.path, TRUTH_FILE))

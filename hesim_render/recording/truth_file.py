@@ -8,7 +8,7 @@ Kinds of ground truth that a run can be asked for.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
 from hesim_render.core.guard import reading
 from hesim_render.core.hdf5 import COMPRESSION, new_file, read_dataset
-from hesim_render.sources.render.truth.scene_truth import SceneTruth
+
+if TYPE_CHECKING:
+    from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
 #: Kinds with one image for each frame or time; all are those of the chief ray through each pixel's centre.
 IMAGES = ("depth", "normals", "position", "ids", "flow", "mixed")
@@ -107,7 +109,7 @@ class TruthRequest:
 
 
 def write_truth(
-    path: Path, truth: SceneTruth, request: TruthRequest, progress: Callable[[int, int], None] | None = None
+    path: Path, truth: "SceneTruth", request: TruthRequest, progress: Callable[[int, int], None] | None = None
 ) -> None:
     """Write the file.
 
@@ -139,7 +141,7 @@ def write_truth(
         _write_series(file, truth, request)
 
 
-def _write_constants(file: Any, truth: SceneTruth) -> None:
+def _write_constants(file: Any, truth: "SceneTruth") -> None:
     names = truth.names
     for kind in ("objects", "instances", "materials"):
         file[f"names/{kind}"] = np.array([name.encode() for name in getattr(names, kind)])
@@ -153,7 +155,7 @@ def _write_constants(file: Any, truth: SceneTruth) -> None:
 
 
 def _write_images(
-    group: Any, truth: SceneTruth, grid: Any, kinds: Sequence[str], rows: NDArray[np.float64], number: int
+    group: Any, truth: "SceneTruth", grid: Any, kinds: Sequence[str], rows: NDArray[np.float64], number: int
 ) -> None:
     """All images of one time, as entry `number` of their data sets.
 
@@ -181,7 +183,7 @@ def _write_images(
 
 
 def images_at(
-    truth: SceneTruth, grid: Any, kinds: Sequence[str], rows: NDArray[np.float64], number: int
+    truth: "SceneTruth", grid: Any, kinds: Sequence[str], rows: NDArray[np.float64], number: int
 ) -> list[tuple[str, NDArray]]:
     """Names and values of the images of one time; rows without a next or a previous time have no flow there.
 
@@ -216,7 +218,7 @@ def images_at(
     return arrays
 
 
-def _write_series(file: Any, truth: SceneTruth, request: TruthRequest) -> None:
+def _write_series(file: Any, truth: "SceneTruth", request: TruthRequest) -> None:
     if "poses" in request.kinds or "light" in request.kinds:
         times = np.arange(0, request.end_us + 1, POSE_STEP_US, dtype=np.float64)
     if "poses" in request.kinds:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,11 @@ from hesim_render.recording.frame import EventTruth, Frame
 from hesim_render.recording.live_view import LiveView, live_file
 from hesim_render.recording.recording import Recording
 from hesim_render.recording.truth_file import TRUTH_FILE, TruthRequest, write_truth
-from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.render.truth.scene_truth import SceneTruth
 from hesim_render.specs.scene import SceneSpec
+
+if TYPE_CHECKING:
+    from hesim_render.sensor.sensor import Sensor
+    from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
 
 class RecordingWriter:
@@ -49,7 +51,7 @@ class RecordingWriter:
     def __init__(
         self,
         path: str | Path | None,
-        sensor: Sensor,
+        sensor: "Sensor",
         *,
         scene: Any = None,
         seed: int,
@@ -140,7 +142,7 @@ class RecordingWriter:
         else:
             self._labels.append(block)
 
-    def write_event_objects(self, truth: SceneTruth) -> None:
+    def write_event_objects(self, truth: "SceneTruth") -> None:
         """Have the object that each event's pixel shows written at the end; nothing in memory, where
         `Recording.event_objects` computes it.
 
@@ -162,7 +164,7 @@ class RecordingWriter:
         for manifest in (self._manifest, *([self._folder.manifest] if self._folder is not None else [])):
             manifest["settings"] = {**manifest["settings"], **settings}
 
-    def write_truth(self, truth: SceneTruth, progress: Callable[[int, int], None] | None = None) -> None:
+    def write_truth(self, truth: "SceneTruth", progress: Callable[[int, int], None] | None = None) -> None:
         """Write the geometric truth that the settings ask for, after the last frame; nothing in memory, where
         `Recording.truth` computes it.
 

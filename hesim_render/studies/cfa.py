@@ -75,7 +75,9 @@ def run_study(spec: StudySpec, progress: Progress | None = None) -> StudyResult:
     pictures: list[tuple[str, NDArray[np.float32]]] = []
     number = 0
     for item in spec.surfaces:
-        chart, cube = _chart(item), _cube(item, spec)
+        # matrices are fitted to the reflectances; of a cube, to the ColorChecker
+        named = reflectance_set("colorchecker") if item.reflectances is None else reflectances_of(item)
+        chart, cube = list(named.values()), _cube(item, spec)
         for light in spec.illuminants:
             spectrum = light.spectrum.load()
             group = []
@@ -91,12 +93,6 @@ def run_study(spec: StudySpec, progress: Progress | None = None) -> StudyResult:
             every += group
             number += len(tried)
     return StudyResult(Table(rows), every, pictures)
-
-
-def _chart(item: SurfacesSpec) -> list[Spectrum]:
-    """The reflectances that matrices are fitted to; of a cube, the ColorChecker."""
-    result = reflectance_set("colorchecker") if item.reflectances is None else reflectances_of(item)
-    return list(result.values())
 
 
 def _cube(item: SurfacesSpec, spec: StudySpec) -> CubeFile | None:

@@ -52,7 +52,8 @@ def middle_and_spread(
         # integers are spread evenly over their step, so that quantiles are not limited to a few values
         parts = by_group(counts + np.random.default_rng(0).uniform(-0.5, 0.5, counts.shape), group)
         # mean without the highest hundredth, which contains the bad pixels, in place of a further quantile
-        quantiles.append(np.array([[*np.quantile(part, list(QUANTILES)), _trimmed_mean(part)] for part in parts]))
+        means = [part[part <= np.quantile(part, 0.99)].mean() for part in parts]
+        quantiles.append(np.column_stack([[np.quantile(part, list(QUANTILES)) for part in parts], means]))
     # [group, quantile]: enough events in both polarities, so that both take the same quantile
     enough = np.min([q[:, :-1] for q in quantiles], axis=0) >= LEAST_EVENTS
     first = np.where(enough.any(axis=1), np.argmax(enough, axis=1), levels.size - 1)
@@ -97,10 +98,6 @@ def middle_and_spread(
         from_mean = v / np.sqrt(np.maximum(1 - (spread * v) ** 2, 0.05))
         middles.append(np.where(has_quantile, from_quantile, from_mean))
     return middles, spread
-
-
-def _trimmed_mean(counts: NDArray) -> float:
-    return float(counts[counts <= np.quantile(counts, 0.99)].mean())
 
 
 def _spread_of_few_events(both: list[NDArray], group: NDArray, means: list[NDArray], trials: int) -> float:
