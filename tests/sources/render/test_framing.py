@@ -97,8 +97,14 @@ def test_edges_lie_where_they_are_in_the_picture():
         (WIDE, {"origin_m": [0.03, 0.05, 0.9], "target_m": [0.07, 0.06, 0], "horizontal_fov_deg": 1.3}, [], None),
         (WIDE, {"origin_m": [0.03, 0.05, 0.9], "target_m": [0.07, 0.06, 2], "horizontal_fov_deg": 1.3}, [], UNSEEN),
         (WIDE, {"origin_m": [0.03, 0.05, 0.9], "target_m": [0.07, 2.3, 0], "horizontal_fov_deg": 1.3}, [], UNSEEN),
+        (
+            {**WIDE, "rotation_deg": 180},
+            {"origin_m": [0.03, 0.05, 0.9], "target_m": [0.07, 0.06, 0], "horizontal_fov_deg": 1.3},
+            [],
+            "sees the target from behind",
+        ),
     ],
-    ids=["outside", "behind", "seen", "comes", "between", "away", "beside"],
+    ids=["outside", "behind", "seen", "comes", "between", "away", "beside", "between behind"],
 )
 def test_a_target_outside_the_picture_is_told(target, camera, motion, told):
     scene = scene_of(target, camera, motion)

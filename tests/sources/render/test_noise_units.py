@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from rendering import make_scene
 
 import hesim_render as hr
 from hesim_render.sources.render.change_driven.error_target import Noise
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
 #: Rows and columns, a multiple of the tile.
 ROWS, COLS = 6, 10
@@ -41,3 +43,18 @@ def test_a_still_value_serves_frames_and_events(sensor, flux):
     np.testing.assert_array_equal(still, np.where(letter == "B", np.minimum(frame, events), moving))
     # which of both is quieter depends on the light
     assert (events[letter == "B"] < frame).all() == (flux < 1e5)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_scene_in_which_something_moves_renders_frames_for_themselves(sensor, moves):
+    card = {"name": "card", "shape": "rectangle", "size_m": [2, 2, 0], "reflectance": 0.5}
+    track = [{"t_us": 0}, {"t_us": 1000, "translation_m": [0.1, 0, 0]}]
+    scene = make_scene(
+        objects=[card], light={"type": "uniform", "illuminance_lux": 100},
+        camera={"origin_m": [0, 0, 2], "target_m": [0, 0, 0]},
+        motion=[{"object": "card", "keyframes": track}] if moves else [],
+    )  # fmt: skip
+    source = ChangeDrivenFlux(scene, sensor)
+    both, light = np.array([1], np.uint32), np.full(1, 300, np.float32)
+    role = "any" if moves else "events"  # at this light events are the quieter ones
+    np.testing.assert_array_equal(source._renderer.noise.of("any", both)(light), Noise(sensor).of(role, both)(light))

@@ -8,6 +8,7 @@ from rendering import make_scene, mono, pair_tracer, traced
 
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.transport.leaving import Leaving
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 
 CAMERA = {"origin_m": [0, 0, 3], "target_m": [0, 0, 0], "horizontal_fov_deg": 20}
@@ -64,3 +65,22 @@ def test_a_scene_far_from_the_origin_is_told(far_m, is_told):
     assert all(
         f"0.384 m large, lies {far_m} m from the origin" in text and "begin 0.04 m off" in text for text in texts
     )
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.3e-3])
+def test_rays_leave_by_a_gap_of_size_and_place(scale):
+    """Mitsuba's own in a large scene. The floor is 0.9 by 0.8, the lamp far away does not count."""
+    mi = mitsuba()
+    leaving = Leaving(mi, build(mi, scene(scale, 2).spec).scene)
+    size = min(1.0, scale * np.sqrt(0.9**2 + 0.8**2 + 0.16**2))
+    place, normal = np.array([0.3, -0.7, 0.2]) * scale, np.array([0.48, 0.6, 0.64])
+    aim, way = np.array([0.1, 0.5, 0.9]) * scale, np.array([-0.6, 0.0, -0.8])
+    point = mi.Interaction3f(mi.Float(1), mi.Float(0), mi.Spectrum(500), mi.Point3f(place), mi.Normal3f(normal))
+    gap = (size + 0.7 * scale) * 1500 * 2.0**-24
+    along, to = leaving.along(point, mi.Vector3f(way)), leaving.to(point, mi.Point3f(aim))
+    for ray, side in ((along, -1), (to, 1)):
+        off = np.array(ray.o, np.float64).ravel() - place
+        np.testing.assert_allclose(off, side * gap * normal, rtol=2e-3, atol=1e-7 * scale)
+    np.testing.assert_allclose(np.array(along.d).ravel(), way, atol=1e-6)
+    end = np.array(to.o).ravel() + np.array(to.d).ravel() * np.array(to.maxt) / (1 - 15000 * 2.0**-24)
+    np.testing.assert_allclose(end, aim, atol=2e-6 * scale)
