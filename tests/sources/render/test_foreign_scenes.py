@@ -29,7 +29,7 @@ from hesim_render.sources.render.exact import RenderedFlux, used_responses
 from hesim_render.sources.render.scene import plugin_tables
 from hesim_render.sources.render.scene.builder import NeedsExactMode, build
 from hesim_render.sources.render.scene.mitsuba_scene import _plugin_dict
-from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.scene.mitsuba_version import files_readable, mitsuba
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.scene import Scene
 from hesim_render.specs.geometry import rotation_about
@@ -437,7 +437,8 @@ def test_a_picture_of_a_lamp_that_mitsuba_would_cut_is_refused(largest, is_refus
     mi = mitsuba()
     values = np.full((3, 4, 3), 0.2, np.float32)
     values[2, 1, 1] = largest
-    mi.Bitmap(values).write(str(tmp_path / "lamp.exr"))
+    with files_readable():
+        mi.Bitmap(values).write(str(tmp_path / "lamp.exr"))
     for picture in ({"bitmap": mi.Bitmap(values)}, {"filename": str(tmp_path / "lamp.exr")}):
         shine = {**LAMP, "emitter": {"type": "area", "radiance": {"type": "bitmap", **picture}}}
         scene = mitsuba_scene({**ROOM, "lamp": shine, "ball": {**BALL, "bsdf": {
@@ -725,7 +726,7 @@ def test_an_environment_map_is_read_on_one_cpu(tmp_path):
 import json
 import os
 os.sched_setaffinity(0, {{min(os.sched_getaffinity(0))}})
-from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.scene.mitsuba_version import files_readable, mitsuba
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.scene import Scene
 shapes = {{"sky": {{"type": "envmap", "filename": r"{tmp_path / "sky.exr"}"}}}}

@@ -11,6 +11,7 @@ import numpy as np
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.parsed_scene import children_of
+from hesim_render.sources.render.scene.mitsuba_version import files_readable
 from hesim_render.sources.render.scene.plugin_tables import (
     EXACT,
     HONOURED,
@@ -217,7 +218,8 @@ def _why_too_bright(properties: Any) -> str | None:
 
     picture = properties.get("bitmap", None) or properties.get("data", None)
     if picture is None:
-        picture = mi.Bitmap(str(mi.file_resolver().resolve(properties["filename"])))  # type: ignore[operator]
+        with files_readable():
+            picture = mi.Bitmap(str(mi.file_resolver().resolve(properties["filename"])))  # type: ignore[operator]
     values = np.array(picture)
     if values.dtype.kind != "f" or not values.size or float(values.max()) <= _WHITE:
         return None
