@@ -726,7 +726,7 @@ def test_an_environment_map_is_read_on_one_cpu(tmp_path):
 import json
 import os
 os.sched_setaffinity(0, {{min(os.sched_getaffinity(0))}})
-from hesim_render.sources.render.scene.mitsuba_version import files_readable, mitsuba
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.scene import Scene
 shapes = {{"sky": {{"type": "envmap", "filename": r"{tmp_path / "sky.exr"}"}}}}

@@ -10,8 +10,8 @@ import numpy as np
 
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
-from hesim_render.sources.render.scene.parsed_scene import children_of
 from hesim_render.sources.render.scene.mitsuba_version import files_readable
+from hesim_render.sources.render.scene.parsed_scene import children_of
 from hesim_render.sources.render.scene.plugin_tables import (
     EXACT,
     HONOURED,
