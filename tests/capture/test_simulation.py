@@ -118,7 +118,12 @@ def test_arguments_out_of_range(options):
 
 @pytest.mark.parametrize(
     ("scene", "how"),
-    [("rotating-star", {}), ("led-grid", {}), ("camera-sweep", {"exact": True}), ("pendulum", {"truth": ["flow"]})],
+    [
+        ("rotating-star", {}),
+        ("led-grid", {}),
+        ("camera-sweep", {"exact": True}),
+        pytest.param("pendulum", {"truth": ["flow"]}, marks=pytest.mark.slow),
+    ],
     ids=["default", "flicker", "exact", "truth"],
 )
 def test_a_run_leaves_no_surfaces_behind(scene, how):

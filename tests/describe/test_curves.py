@@ -220,6 +220,7 @@ def test_the_shot_limit_is_white_noise_through_two_poles():
     assert event_curves(fixed, [3.0]).shot_limit[0] == pytest.approx(1 / math.sqrt(counted), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_threshold_and_mismatch_of_a_data_sheet_are_those_of_simulated_s_curves():
     sensor = hr.load_sensor("imx636", SLOW).crop(128, 128)
     bright = 50_000.0

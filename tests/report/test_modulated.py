@@ -61,6 +61,7 @@ def band_bench(folder, in_bursts, seed):
     return written(folder, modulation, files)
 
 
+@pytest.mark.slow
 def test_bursts_show_the_bandwidth_of_pixels_with_a_long_dead_time(tmp_path):
     """The corner of the low-pass, although the dead time is longer than its period."""
     found = bandwidth(band_bench(tmp_path / "bursts", True, 11), EVERY)

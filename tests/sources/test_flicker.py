@@ -186,6 +186,7 @@ def test_lights_add_up():
     assert middle.min() < 0.5 * middle.max()
 
 
+@pytest.mark.slow
 def test_one_instant_agrees_with_the_second_estimator():
     sensor, t_us = mono(12, 8), 1100.0
     scene = card(*LIGHTS)

@@ -134,6 +134,7 @@ def measure(package, seed, device_seed):
     return {name: value - 1 for name, value in found.items()}, relative_errors(photons_per_s, pixels)
 
 
+@pytest.mark.slow
 def test_package_finds_what_was_configured(monkeypatch):
     """K, QE, dark noise, dark current, DSNU and PRNU within 0.5 %, and within 5 of their standard errors.
 

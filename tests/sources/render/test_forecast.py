@@ -13,7 +13,7 @@ from hesim_render.sources.renderer import Demand
 
 @pytest.mark.parametrize(("scene", "sensor", "region", "duration_us"), [
     ("camera-sweep", "gen2", (1400, 1100, 900, 700), 20_000), ("camera-sweep", "davis346", (160, 120, 90, 60), 1500),
-    ("pendulum", "davis346", (200, 150, 70, 50), 1500),
+    pytest.param("pendulum", "davis346", (200, 150, 70, 50), 1500, marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_samples_of_pixels_have_the_rays_of_all(scene, sensor, region, duration_us):
     """Most rays are spent on few pixels: twelve large patches were off by up to a factor of 2.5."""

@@ -69,6 +69,7 @@ def test_lit_objects_with_interreflection(light):
     assert_agreement(estimates(scene, sensor, 64, 8), reference_flux(scene, sensor, 64, repeats=16, seed=100))
 
 
+@pytest.mark.slow
 def test_cornell_box_off_the_axis():
     camera = {"origin_m": (0, 0, 3.9), "target_m": (0, 0, 0), "up": (0, 1, 0), "focal_length_mm": 3.0}
     scene = hr.load_scene("cornell-box", {"max_depth": 4, "camera": camera})
@@ -77,6 +78,7 @@ def test_cornell_box_off_the_axis():
     assert_agreement(ours, reference_flux(scene, sensor, 128, repeats=16, seed=100))
 
 
+@pytest.mark.slow
 def test_moving_target_and_camera_at_one_instant():
     changes = {
         "motion": [
