@@ -132,19 +132,23 @@ def test_shadow_rays_meet_what_is_hidden(code):
 def test_what_stands_within_or_behind_hides_nothing():
     """A point in a box or a ball, in the plane of the plate, one whose horizon cuts the lamp, and one behind it."""
     lamp = frame()
-    inside_box, inside_ball = BOX[0] + BOX[1:].sum(axis=0) * [0.4, 0.5, 0.3], BALL + np.array([0.1, 0.05, -0.2])
-    in_plane = PLATE[0] + 1.7 * PLATE[1] - 0.4 * PLATE[2]
+    inside_box, inside_ball = BOX[0] + BOX[1:].sum(axis=0) * [0.4, 0.5, 0.3], BALL + np.array([0.2, 0.1, -0.25])
+    in_plane, on_plate = (PLATE[0] + u * PLATE[1] + v * PLATE[2] for u, v in ((1.7, -0.4), (0.3, 0.6)))
     behind = lamp[:3, 3] - 0.2 * lamp[:3, 2] + [0.4, 0.1, 0]
     up, level = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.05]) / 1.00125**0.5
     for code, point, normal in (
         (BOX_CODE, inside_box, up), (BALL_CODE, inside_ball, up), (PLATE_CODE, in_plane, up),
+        (PLATE_CODE, on_plate + 1e-6 * up, up), (PLATE_CODE, on_plate - 1e-6 * up, up),
         (BOX_CODE, np.array([0.0, 0.1, 0.2]), level), (BALL_CODE, behind, -up),
     ):  # fmt: skip
         hidden, count, _ = before(code, np.tile(point, (512, 1)), np.tile(normal, (512, 1)))
         assert not hidden.any() and not count.any(), (code, point)
-    # a ball that reaches behind the lamp is not counted, in whatever direction
-    with mock.patch.dict(globals(), BALL=lamp[:3, 3] + 0.3 * lamp[:3, 2]):
-        hidden, count, _ = before(BALL_CODE, np.tile([0.0, 0.1, 0.2], (512, 1)), np.tile(up, (512, 1)))
+    # a ball or a box that reaches behind the lamp is not counted
+    for code, shape in ((BALL_CODE, {"BALL": lamp[:3, 3] + 0.3 * lamp[:3, 2]}), (BOX_CODE, {"BOX": BOX.copy()})):
+        if "BOX" in shape:
+            shape["BOX"][0] = lamp[:3, 3] + 0.15 * lamp[:3, 2]
+        with mock.patch.dict(globals(), shape):
+            hidden, count, _ = before(code, np.tile([0.0, 0.1, 0.2], (512, 1)), np.tile(up, (512, 1)))
         assert not hidden.any() and not count.any()
 
 

@@ -137,7 +137,6 @@ def _edges_within(
             cut = here * dr.rcp(here - there)
             begin = dr.select((here < 0) & (cut > begin), cut, begin)
             end = dr.select((there < 0) & (cut < end), cut, end)
-            end = dr.select((here < 0) & (there < 0), -1, end)
         side = corners[following] - corner
         near = dr.fma(dr.dot(corner, side), begin + end, dr.dot(corner, corner))
         along = dr.fma(dr.dot(side, side), begin * end, near)
