@@ -532,7 +532,9 @@ def run_tests(tests: tuple[str, ...], mutant: Mutant | None, timeout_s: float | 
             source = Path(folder) / "mutant.py"
             source.write_text(mutant.make(), encoding="utf-8")
             environment |= {_NAME: f"hesim_render.{mutant.module}", _SOURCE: str(source)}
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "tests.mutate", "-p", "no:cacheprovider", *tests]
+        # slow tests too: the one of a mutant may be one of them
+        chosen = "-m", "slow or not slow", "-p", "tests.mutate", "-p", "no:cacheprovider"
+        command = [sys.executable, "-m", "pytest", "-x", "-q", *chosen, *tests]
         try:
             child = subprocess.run(
                 command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=timeout_s
