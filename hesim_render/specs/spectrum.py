@@ -175,11 +175,7 @@ class SpectrumSpec(InFolder):
             )
         if self.silicon_depth_um is not None:
             return physical.silicon_quantum_efficiency(self.silicon_depth_um, self.surface)
-        grid = physical.GRID_NM
         if self.blackbody_k is not None:
-            # Planck's law in relative units; c2 = h c / k_B = 1.438777e7 nm K (CODATA 2018)
-            power = grid**-5 / np.expm1(1.438776877e7 / (grid * self.blackbody_k))
-            return Spectrum(grid, power / power.max())
+            return physical.blackbody(self.blackbody_k)
         assert self.peak_nm is not None and self.fwhm_nm is not None
-        sigma = self.fwhm_nm / 2.354820045
-        return Spectrum(grid, np.exp(-0.5 * ((grid - self.peak_nm) / sigma) ** 2))
+        return physical.gaussian_band(self.peak_nm, self.fwhm_nm)

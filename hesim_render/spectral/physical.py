@@ -86,3 +86,20 @@ def thin_film_transmittance(
     stack = [incidence_index, *indices, substrate_index]
     _, passed = colour_science().phenomena.multilayer_tmm(stack, list(thicknesses_nm), grid_nm, angle_deg)
     return Spectrum(grid_nm, np.clip(np.asarray(passed, dtype=np.float64)[:, 0, 0].mean(axis=-1), 0.0, 1.0))
+
+
+def blackbody(temperature_k: float) -> Spectrum:
+    """Relative spectrum of a black body by Planck's law, 1 at its largest value on `GRID_NM`.
+
+    c2 = h c / k_B = 1.438776877e7 nm K (CODATA 2018).
+    """
+    power = GRID_NM**-5 / np.expm1(1.438776877e7 / (GRID_NM * temperature_k))
+    return Spectrum(GRID_NM, power / power.max())
+
+
+def gaussian_band(peak_nm: float, fwhm_nm: float) -> Spectrum:
+    """A band of the form of a Gaussian, 1 at its peak, by its full width at half maximum, 2·√(2 ln 2) standard
+    deviations.
+    """
+    sigma = fwhm_nm / 2.354820045
+    return Spectrum(GRID_NM, np.exp(-0.5 * ((GRID_NM - peak_nm) / sigma) ** 2))
