@@ -532,9 +532,10 @@ def run_tests(tests: tuple[str, ...], mutant: Mutant | None, timeout_s: float | 
             source = Path(folder) / "mutant.py"
             source.write_text(mutant.make(), encoding="utf-8")
             environment |= {_NAME: f"hesim_render.{mutant.module}", _SOURCE: str(source)}
-        # slow tests too: the one of a mutant may be one of them
-        chosen = "-m", "slow or not slow", "-p", "tests.mutate", "-p", "no:cacheprovider"
-        command = [sys.executable, "-m", "pytest", "-x", "-q", *chosen, *tests]
+        # a test that is named may be a slow one; of whole files the quick ones do
+        chosen = ("-m", "slow or not slow") if any("::" in test for test in tests) else ()
+        plugins = "-p", "tests.mutate", "-p", "no:cacheprovider"
+        command = [sys.executable, "-m", "pytest", "-x", "-q", *chosen, *plugins, *tests]
         try:
             child = subprocess.run(
                 command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=timeout_s
