@@ -61,8 +61,6 @@ class DecisionRays(PacketTracer):
         """
         out, moments, key = EdgeFit.empty(pixel.size), self._moments(windows, None), self._key(stream)
         footprint, packets = dr.opaque(jit().Float, footprint_px), np.full(pixel.size, samples // PACKET)
-        if shadows is not None:
-            controlled = controlled | (shadows > 0)
         for part, _, known in in_blocks(packets, self._block_rays // PACKET, None, None, shadows):
             lanes = pixel[part], window[part].astype(np.uint32), np.zeros(pixel[part].size, np.uint32)
             inputs = (
@@ -104,8 +102,8 @@ class DecisionRays(PacketTracer):
         for part, *_ in in_blocks(packets, self._block_rays // PACKET, None, None):
             repeat = np.full(pixel[part].size, _SHADOW_REPEAT, np.uint32)
             lanes = pixel[part], window[part].astype(np.uint32), repeat
-            packets = np.full(repeat.size, _SHADOW_RAYS // PACKET)
-            rays, _ = self._started(lanes, packets, packets * PACKET, moments, key, footprint, None)
+            own = packets[part]
+            rays, _ = self._started(lanes, own, own * PACKET, moments, key, footprint, None)
             met = np.array(self._integrator.shadows_of(self._sampler, rays.ray, rays.now))
             self._sampler.rest()
             out[part] = most_frequent(met.reshape(repeat.size, _SHADOW_RAYS))

@@ -72,8 +72,6 @@ class PairTracer(DecisionRays):
         packets = (samples // PACKET).astype(np.int64)
         moments = self._moments(windows, span_us)
         key, times = self._key(stream), np.broadcast_to(np.asarray(repeat, np.uint32), pixel.shape)
-        if shadows is not None:
-            controlled = controlled | (shadows > 0)
         for part, aimed, known in in_blocks(packets, self._block_rays // PACKET, aims, edges, shadows):
             lanes = pixel[part], window[part].astype(np.uint32), times[part]
             others = *flux_inputs(windows, span_us, aimed), known
