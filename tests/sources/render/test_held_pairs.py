@@ -321,6 +321,7 @@ class Deciding:
         wanted = [4 * ERROR[p] / FACTOR[p] for _, p in keys]
         np.testing.assert_allclose(little, wanted, rtol=1e-6)
         np.testing.assert_array_equal(controlled, [(w + p) % 3 == 0 for w, p in keys])
+        np.testing.assert_array_equal(shadows, [7 * w + p for w, p in keys])
         self.calls.append(keys)
         self.rays_done += 64 * len(keys)
         return fit_of([self.table[key] for key in keys])
@@ -343,7 +344,7 @@ def followed(fitted, asked, table, floor=(), difference=(), pilot=200.0):
     what = Plan(
         masks[2], np.full(shape, 512, np.int16), (window + pixel) % 3 == 0, np.ones(shape, np.float32),
         np.tile(ERROR, (COUNT, 1)), floors, differences, masks[0], masks[3], masks[1],
-        np.broadcast_to(np.float32(pilot), shape),
+        np.broadcast_to(np.float32(pilot), shape), shadows=(7 * window + pixel).astype(np.uint32),
     )  # fmt: skip
     tracer = Deciding(table)
     own = SimpleNamespace(tracer=tracer, tuning=TUNING, counts=SimpleNamespace(rays=30), _footprint_px=lambda band: 1.0)

@@ -9,6 +9,10 @@ from rendering import make_scene, mono, pair_tracer
 
 import hesim_render as hr
 from hesim_render.core.device import dr
+from hesim_render.core.rng import Stream
+from hesim_render.sources.render.change_driven import decision_rays
+from hesim_render.sources.render.change_driven.known_shadows import with_known_shadows
+from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.transport import occluded_lamps
@@ -198,8 +202,10 @@ def thing(name, shape, size, position, reflectance, **more):
     return {**placed, **{"rotation_axis": [1, 0, 0.2], **more}}
 
 
-def room():
-    """A floor, with a box that turns about a skew axis, a ball, and a post with a plate on it, below two panels."""
+def room(ball_m=(0.35, 0.2, 0.1), ball_moves=()):
+    """A floor seen from its back, with a box that turns about a skew axis, a ball, and a post with a plate on it, below
+    two panels.
+    """
     turn = {"rotation_axis": [0.2, 1, 0.3], "rotation_deg": 50, "translation_m": [0.05, 0.1, 0]}
     panel = {"type": "area", "illuminant": "LED-B3", "plane_point_m": [0, 0, 0], "plane_normal": [0, 1, 0]}
     one = {"illuminance_lux": 900, "position_m": [0.4, 1.6, 0.5], "size_m": [0.6, 0.4]}
@@ -207,15 +213,15 @@ def room():
     beam = {"type": "directional", "illuminant": "LED-B3", "direction": [0.3, -1, -0.4], "illuminance_lux": 200}
     return make_scene(
         objects=[
-            thing("floor", "rectangle", [3, 3, 0], [0, 0, 0], 0.55, rotation_deg=-90, rotation_axis=[1, 0, 0]),
+            thing("floor", "rectangle", [3, 3, 0], [0, 0, 0], 0.55, rotation_deg=90, rotation_axis=[1, 0, 0]),
             thing("box", "box", [0.3, 0.22, 0.4], [-0.3, 0.35, 0], 0.4),
-            thing("ball", "sphere", [0.34] * 3, [0.35, 0.2, 0.1], 0.7),
+            thing("ball", "sphere", [0.34] * 3, list(ball_m), 0.7),
             thing("post", "box", [0.06, 0.5, 0.06], [0.05, 0.25, -0.3], 0.3),
             thing("plate", "rectangle", [0.3, 0.2, 0], [0.05, 0.52, -0.3], 0.6, rotation_deg=-70),
         ],
         light=[{**panel, **one}, {**panel, **other}, beam],
         camera={"origin_m": [0.1, 1.1, 1.5], "target_m": [0, 0.15, -0.05], "horizontal_fov_deg": 42},
-        motion=[{"object": "box", "keyframes": [{"t_us": 0}, {"t_us": 40_000, **turn}]}],
+        motion=[{"object": "box", "keyframes": [{"t_us": 0}, {"t_us": 40_000, **turn}]}, *ball_moves],
     )
 
 
@@ -258,3 +264,80 @@ def test_flux_with_known_shadows_is_that_without():
 def test_a_scene_without_lamps_or_shapes_knows_none():
     assert not pair_tracer(hr.load_scene("rotating-star"), mono(32, 24), seed=2).knows_shadows
     assert not pair_tracer(hr.load_scene("glass-and-metal"), mono(32, 24), seed=2).knows_shadows
+
+
+def test_things_that_move_cast_the_shadows_of_things_at_rest_there():
+    """A ball that comes to a place, against one that is there; eight bits for each of two lamps."""
+    there = {"translation_m": [0.25, 0.05, 0.35]}
+    keys = [{"t_us": 0}, {"t_us": 30_000, **there}, {"t_us": 60_000, **there}]
+    comes = room(ball_moves=[{"object": "ball", "keyframes": keys}])
+    is_there = room(ball_m=(0.6, 0.25, 0.45))
+    window, counts, met = Windows(np.array([41e3]), np.array([43e3])), [], []
+
+    def recorded(values):
+        met.append(values)
+        return most_frequent(values)
+
+    for scene in (comes, is_there):
+        tracer = pair_tracer(scene, mono(96, 72), seed=5)
+        rows = np.array(tracer._integrator._shadows._rows).reshape(-1, 16)
+        ball = 1 + int(np.flatnonzero(rows[:, 11])[0])
+        pixel = tracer.sensor.layout.full_index.ravel()
+        with mock.patch.object(decision_rays, "most_frequent", recorded):
+            codes = tracer.shadows(pixel, np.zeros(pixel.size, int), window, 1.3)
+        counts.append((codes[:, None] >> np.arange(0, 32, 8, dtype=np.uint32) & 255 == ball).any(axis=1))
+    assert counts[1].sum() > 200 and np.count_nonzero(counts[0] != counts[1]) <= 5
+    # eight bits for each lamp
+    for values in met:
+        one, other = values & 255, values >> 8
+        assert one.any() and other.any() and max(one.max(), other.max()) <= 5 and np.any(one * other == 0)
+
+
+class Shaded:
+    """A tracer that knows the shadows `codes`, with which pairs scatter by `scatter` and let `light` through."""
+
+    knows_shadows = True
+
+    def __init__(self, codes, scatter, light):
+        self.codes, self.scatter, self.light, self.asked = codes, scatter, light, []
+
+    def shadows(self, pixel, window, windows, width_px, stream):
+        self.asked.append((pixel.tolist(), window.tolist(), width_px, stream))
+        return self.codes[pixel]
+
+    def pilot(self, pixel, window, windows, rays, width_px, stream, mild, shadows):
+        assert np.all(shadows == self.codes[pixel]) and (rays, width_px, mild) == (32, 1.3, True)
+        out = PilotFlux.empty(pixel.size)
+        out.controlled[:], out.plain[:], out.controlled_change[:] = 91, 91, 77
+        out.controlled_scatter[:] = out.plain_scatter[:] = self.scatter[pixel]
+        out.unshadowed[:] = self.light[pixel]
+        return out
+
+
+def test_shadows_are_known_where_they_save_rays():
+    """Wanted error 2: light above 8 is hidden, 64 rays are asked for by scatter or light, and half are saved."""
+    # 0: penumbra. 1: scatters as before. 2: 7 of light hidden. 3: few rays. 4: full shadow. 5: not asked. 6: no shape
+    scatter = np.array([120, 120, 120, 5, 0, 120, 120], np.float32)
+    flux = np.array([150, 150, 393, 150, 0, 150, 150], np.float32)
+    open_flux = np.array([400, 400, 400, 160, 900, 400, 400], np.float32)
+    codes = np.array([7, 7, 7, 7, 9, 7, 0], np.uint32)
+    light = np.array([92, 400, 90, 80, 0, 90, 90], np.float32)
+    tracer = Shaded(codes, np.array([4, 119, 4, 1, 0, 4, 4], np.float32), light)
+    seen = PilotFlux.empty(7)
+    seen.controlled[:], seen.plain[:], seen.unshadowed[:] = flux + 1, flux, open_flux
+    seen.controlled_scatter[:], seen.plain_scatter[:], seen.controlled_change[:] = 500, scatter, 33
+    pairs = np.arange(7, dtype=np.uint32), np.arange(7) + 3, None
+    given = tracer, pairs, seen, 32, 1.3, lambda flux: np.full(flux.shape, 2, np.float32), True
+    out, known = with_known_shadows(*given, stream=Stream.AUDIT_PILOT, among=np.arange(7) != 5)
+    assert tracer.asked == [([0, 1, 4, 6], [3, 4, 7, 9], 1.3, Stream.AUDIT_PILOT)]
+    assert known.tolist() == [7, 0, 0, 0, 9, 0, 0]
+    np.testing.assert_array_equal(out.controlled, np.where(known > 0, 91, flux + 1))
+    np.testing.assert_array_equal(out.unshadowed[[0, 1, 4]], [92, 400, 0])
+    assert np.all(out.controlled_change == 33)
+    # by the light of a ray alone: 100 rays, of which 40 or 60 are left
+    for left, expected in ((160, 7), (240, 0)):
+        tracer.scatter[0], tracer.light[0], seen.plain_scatter[0] = 1, left, 1
+        assert with_known_shadows(*given)[1][0] == expected
+    assert not with_known_shadows(*given[:5], None, True)[1].any()
+    tracer.knows_shadows = False
+    assert not with_known_shadows(*given)[1].any()
