@@ -287,10 +287,10 @@ def test_things_that_move_cast_the_shadows_of_things_at_rest_there():
             codes = tracer.shadows(pixel, np.zeros(pixel.size, int), window, 1.3)
         counts.append((codes[:, None] >> np.arange(0, 32, 8, dtype=np.uint32) & 255 == ball).any(axis=1))
     assert counts[1].sum() > 200 and np.count_nonzero(counts[0] != counts[1]) <= 5
-    # eight bits for each lamp
+    # eight bits for each lamp; five things, and the lamps themselves
     for values in met:
         one, other = values & 255, values >> 8
-        assert one.any() and other.any() and max(one.max(), other.max()) <= 5 and np.any(one * other == 0)
+        assert one.any() and other.any() and max(one.max(), other.max()) <= 7
 
 
 class Shaded:
