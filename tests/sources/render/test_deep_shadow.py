@@ -262,6 +262,11 @@ def test_pixels_in_deep_shadow_follow_their_light():
     beside = (exact - truth) / unit
     assert np.abs(beside).max() < 2.5 and np.sqrt(np.mean(beside**2)) < 0.65 and deep_looks(calls_then) < 60
     assert third.counts.rays < source.counts.rays / 2
+    # the reference of an audit knows the shadow as well
+    before, seen = third._tracer.rays_done, np.tile(pixels, 16)
+    reference = third.reference_flux(seen, ends[window] - 1000, ends[window], 0.25, True)[0].reshape(16, -1)
+    assert np.sqrt(np.mean(((reference - truth) / unit) ** 2)) < 0.65
+    assert third._tracer.rays_done - before < 400 * count
     # where it is worst, the block begins in the dark
     dark = np.argmax(np.abs(straight).max(axis=0))
     assert truth[2, dark] == 0 and truth[-1, dark] > 25 * unit[-1, dark]

@@ -607,3 +607,19 @@ def test_held_pairs_are_as_right_as_rendered_ones(monkeypatch, whole, sensor):
     # all other rendered pairs are the same to the bit
     window, pixel = np.nonzero(block.what.rendered[1:64])
     np.testing.assert_array_equal(flux[window, :, block.place[pixel]], own[window, :, block.place[pixel]])
+
+
+def test_decision_rays_of_a_plan_know_its_shadows():
+    shape, calls = (COUNT, 3), []
+    window, pixel = np.indices(shape)
+    todo = (window + 2 * pixel) % 3 == 1
+    what = SimpleNamespace(
+        rays=np.full(shape, 512), controlled=todo, wanted=1.5 + pixel, floor=0 * pixel, shadows=7 * window + pixel
+    )
+    own = SimpleNamespace(tracer=SimpleNamespace(rays=SimpleNamespace(is_box=True)), gain=None, tuning=TUNING)
+    with mock.patch.object(adaptive, "about_edges", lambda *given, **more: calls.append(more)):
+        AdaptiveRenderer.rays_of(own, None, what, todo, None)
+        what.shadows = None
+        AdaptiveRenderer.rays_of(own, None, what, todo, None)
+    np.testing.assert_array_equal(calls[0]["shadows"], (7 * window + pixel)[todo])
+    assert calls[1]["shadows"] is None and calls[0]["tried"] is None
