@@ -117,12 +117,36 @@ def test_extra_looks_are_those_without_the_short_cut(monkeypatch):
             np.testing.assert_array_equal(one.place, other.place)
 
 
-def test_glossy_scenes_and_windows_across_periods_take_no_short_cut():
-    body = {"name": "card", "shape": "box", "size_m": [0.5, 0.4, 0.3], "position_m": [0, 0, 0]}
-    shiny = {**body, "reflectance": 0.4}
-    motion = [flight("card", [0.05, 0.02, 0], 2.0)]
-    matt = zoom_of([shiny], motion)
-    assert matt._large_within(10, 900) == frozenset({0})
-    assert matt._large_within(63_900, 64_100) == frozenset()
-    matt._is_diffuse = False
-    assert matt._large_within(10, 900) == frozenset()
+def test_windows_across_periods_take_no_short_cut():
+    body = {"name": "card", "shape": "box", "size_m": [0.5, 0.4, 0.3], "position_m": [0, 0, 0], "reflectance": 0.4}
+    zoom = zoom_of([body], [flight("card", [0.05, 0.02, 0], 2.0)])
+    assert zoom._large_within(10, 900) == frozenset({0})
+    assert zoom._large_within(63_900, 64_100) == frozenset()
+
+
+def test_large_objects_get_looks_where_they_may_gloss_whatever_else_is_in_the_scene():
+    """A plastic card, one with holes, and two painted ones; a ball that glows does not move."""
+    surfaces = {
+        "plastic": {"material": {"type": "roughplastic", "alpha": 0.07}},
+        "grey": {"reflectance": 0.2},
+        "mask": {"material": {"type": "mask", "opacity": 0.7, "bsdf": {"type": "diffuse"}}},
+        "paint": {"reflectance": 0.4, "pattern": 0.1, "pattern_count": [3, 2]},
+    }
+    places = {"plastic": [-0.2, 0.12, 0], "grey": [0.2, 0.12, 0], "mask": [-0.2, -0.12, 0], "paint": [0.2, -0.12, 0]}
+    objects = [
+        {"name": name, "shape": "rectangle", "size_m": [0.3, 0.2, 0], "position_m": places[name], **surface}
+        for name, surface in surfaces.items()
+    ]
+    glow = {"luminance_cd_m2": 90}
+    ball = {"name": "lamp", "shape": "sphere", "size_m": [0.1] * 3, "position_m": [0, 0, 0.3], "emission": glow}
+    zoom = zoom_of([*objects, ball], [flight(name, [0.02, 0.01, 0], 2.0) for name in surfaces])
+    names = [group.name for group in zoom._groups]
+    assert {names[k] for k in zoom._large_within(10, 900)} == {"grey", "paint"}
+    sensor = zoom._view.sensor
+    row, col = np.divmod(sensor.layout.full_index.ravel().astype(np.int64), sensor.spec.geometry.cols)
+    windows = Windows(np.array([1000.0]), np.array([1450.0]))
+    (looks,) = zoom.sites(row, col, windows, np.zeros((1, row.size), np.int64))
+    seen = np.concatenate([look.place for look in looks])
+    # 400 pixels a metre, and a pixel around: the two cards on the left, and nothing else
+    assert np.all(col[seen] - col.min() < 160) and 0.95 < seen.size / (2 * (120 + 3) * (80 + 3)) < 1.05
+    assert {look.is_small for look in looks} == {False}

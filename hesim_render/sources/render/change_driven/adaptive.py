@@ -62,9 +62,7 @@ class AdaptiveRenderer:
         # windows of an asynchronous sensor are so close that nothing moves far from one to the next
         self.has_ticks = evs is None or evs.tick_us is not None
         self.look_stride = 1 if self.has_ticks else tuning.look_stride
-        self.zoom = Zoom(
-            tracer.view, tracer.camera, tracer.parts.groups, tracer.is_diffuse, tuning, rays.can_aim, rays.blur_px
-        )
+        self.zoom = Zoom(tracer.view, tracer.camera, tracer.parts.groups, tuning, rays.can_aim, rays.blur_px)
         self._kept: dict[Role, Still] = {}
 
     def still(self, role: Role) -> Still:

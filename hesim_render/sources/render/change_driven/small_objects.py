@@ -2,7 +2,7 @@
 
 Sixteen rays miss an object that covers a fiftieth of a pixel seven times out of ten, and a spark or a glint can be
 hundreds of times as bright as its surroundings. Small objects therefore get more pilot rays, and their pixels are
-rendered while they pass. Where surfaces may be glossy, large objects get extra rays too, but fewer, within a budget.
+rendered while they pass. Large objects that may be glossy get extra rays too, but fewer, within a budget.
 Outlines hold for every instant of a window (`motion_bounds`). The number of rays depends on the whole picture, not on
 the read-out region.
 """
@@ -84,8 +84,7 @@ class Zoom:
     ----------
     view : the camera at rest.
     camera : track of the camera, None if it rests.
-    groups : moving objects.
-    is_diffuse : True if all surfaces are diffuse; large objects then need no extra rays.
+    groups : moving objects; large ones that are diffuse need no extra rays.
     tuning : constants.
     can_aim : False if rays of this lens cannot be aimed.
     blur_px : radius of the PSF that holds nearly all of it, px.
@@ -96,13 +95,12 @@ class Zoom:
         view: View,
         camera: Trajectory | None,
         groups: list[Group],
-        is_diffuse: bool,
         tuning: Tuning,
         can_aim: bool = True,
         blur_px: float = 0.0,
     ) -> None:
         self._view, self._camera, self._groups = view, camera, groups
-        self._is_diffuse, self._tuning = is_diffuse, tuning
+        self._tuning = tuning
         # bands of rows ask for the same windows one after another, and so does the audit
         self._outlines = method_cache(self._outlines_in, maxsize=64)
         self._large = method_cache(self._large_in, maxsize=64)
@@ -126,7 +124,7 @@ class Zoom:
             if number in large:
                 continue
             outline = self._outline(number, group, begin_us, end_us)
-            if outline is None or (self._is_diffuse and not outline.is_small):
+            if outline is None or (group.is_diffuse and not outline.is_small):
                 continue
             size = np.maximum(np.minimum(outline.high, self._high) - np.maximum(outline.low, self._low), 0) + 2 * margin
             by_size[outline.is_small].append((float(np.prod(size)), outline))
@@ -148,12 +146,12 @@ class Zoom:
     def _large_within(self, begin_us: float, end_us: float) -> frozenset[int]:
         """Numbers of objects that need no look in a window, because they are large throughout a longer period."""
         period = int(begin_us // _SORTED_US)
-        if not self._is_diffuse or end_us > (period + 1) * _SORTED_US:
+        if end_us > (period + 1) * _SORTED_US:
             return frozenset()
         return self._large(period)
 
     def _large_in(self, period: int) -> frozenset[int]:
-        """Numbers of objects that are far from small at every instant of a period.
+        """Numbers of diffuse objects that are far from small at every instant of a period.
 
         Between two instants an extent may change further than at them. It must therefore also exceed the limit by twice
         its largest change from one instant to the next.
@@ -162,6 +160,8 @@ class Zoom:
         times, limit = np.linspace(begin, end, _INSTANTS), self._tuning.small_px
         large = set()
         for number, group in enumerate(self._groups):
+            if not group.is_diffuse:
+                continue
             poses = group.trajectory.matrix(times)
             points = group.corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
             if self._camera is not None:  # in the frame of the camera, as the resting one would see it

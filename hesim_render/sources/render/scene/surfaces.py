@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hesim_render.core.device_types import MitsubaModule
+from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.files import require_material
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, spectrum_dict, transform
@@ -44,6 +44,13 @@ class Paint:
 def is_diffuse(item: ObjectSpec) -> bool:
     """True if an object is diffuse, of one or two colours, and does not shine."""
     return item.material is None and item.texture is None and item.emission is None and item.materials == "own"
+
+
+def reflects_diffusely(mi: MitsubaModule, bsdf: MitsubaObject | None) -> bool:
+    """True if a BSDF has neither gloss nor mirror, glass or holes, so that rays of a pixel hardly differ on it."""
+    flags = None if bsdf is None else bsdf.flags()
+    others = mi.BSDFFlags.Glossy, mi.BSDFFlags.Delta, mi.BSDFFlags.Delta1D
+    return flags is not None and not any(mi.has_flag(flags, other) for other in others)
 
 
 def paint_of(item: ObjectSpec, name: str) -> Paint:

@@ -30,6 +30,7 @@ from hesim_render.core.device_types import (
 )
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.builder import BuiltScene, NeedsExactMode, require_paths
+from hesim_render.sources.render.scene.surfaces import reflects_diffusely
 from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.closed_form import Part, surface_of
@@ -53,6 +54,7 @@ class Group:
     part : the shapes at rest.
     trajectory : their motion.
     corners : bounding-box corners at rest, [n, 3], m.
+    is_diffuse : True if all its surfaces reflect diffusely, whether they emit light or not.
     """
 
     name: str
@@ -60,6 +62,7 @@ class Group:
     part: Part
     trajectory: Trajectory
     corners: NDArray[np.float64]
+    is_diffuse: bool
 
 
 class Surface:
@@ -174,7 +177,8 @@ class MovingScene:
             own = mi.load_dict({"type": "scene", **shapes}, optimize=False)
             part = Part(mi, own, apart=True, faces_before=faces)
             corners = np.concatenate([part.corners for part in built.groups[name]])
-            self.groups.append(Group(name, own, part, built.trajectories[name], corners))
+            is_diffuse = all(reflects_diffusely(mi, shape.bsdf()) for shape in own.shapes())
+            self.groups.append(Group(name, own, part, built.trajectories[name], corners, is_diffuse))
             faces += part.face_count
         self._sort_groups()
 
