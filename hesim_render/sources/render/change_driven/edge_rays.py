@@ -72,7 +72,7 @@ def about_edges(
     is_edge = fit.is_edge & (contrast >= 1)
     # both sides belong to the scatter of a pair that has no edge
     by_scatter = gain.rays(np.where(is_edge, 0, 0.5 * contrast) + fit.scatter / wanted)
-    is_flat = ~is_edge & (contrast < tuning.low_contrast)
+    is_flat = ~is_edge & ((contrast < tuning.low_contrast) | moves)
     # an edge: its contrast says how much a ray weighs that finds the model wrong; half of the rays start in the strip
     per_contrast = tuning.moving_contrast_rays if moves else tuning.edge_contrast_rays
     needed = np.where(is_edge, np.maximum(2 * by_scatter, per_contrast * contrast), by_scatter)
