@@ -20,6 +20,7 @@ from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.pilot import Anchored, Pilot, take_pilot
 from hesim_render.sources.render.change_driven.plan import Plan, plan
+from hesim_render.sources.render.change_driven.sample_instants import MotionClock
 from hesim_render.sources.render.change_driven.small_objects import Zoom
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -40,6 +41,7 @@ class AdaptiveRenderer:
     noise : noise of the sensor, in which errors are wanted.
     quality : wanted error over that noise.
     tuning : constants of the method.
+    clock : knows how fast anything moves in the image.
 
     Attributes
     ----------
@@ -52,8 +54,8 @@ class AdaptiveRenderer:
     has_ticks : True if event pixels compare at a fixed tick.
     """
 
-    def __init__(self, tracer: PairTracer, noise: Noise, quality: float, tuning: Tuning) -> None:
-        self.tracer, self.noise, self.quality, self.tuning = tracer, noise, quality, tuning
+    def __init__(self, tracer: PairTracer, noise: Noise, quality: float, tuning: Tuning, clock: MotionClock) -> None:
+        self.tracer, self.noise, self.quality, self.tuning, self._clock = tracer, noise, quality, tuning, clock
         self.gain = Gain(*(tuning.diffuse_gain if tracer.is_diffuse else tuning.path_gain))
         self.counts = Counts()
         self._sensor = tracer.sensor
@@ -127,7 +129,8 @@ class AdaptiveRenderer:
         def wanted(flux: NDArray[np.float32]) -> NDArray[np.float32]:
             return np.float32(band.quality) * band.unit(flux)
 
-        pilot, near = take_pilot(*given, wanted, band.mild)
+        few = self._clock.windows_of_a_pixel(*windows.span_us, windows.size - 1) if self.has_ticks else 1
+        pilot, near = take_pilot(*given, wanted, band.mild, few)
         if band.apart and pilot.windows > 2:
             # no neighbour tells when deep shadow ends
             seen = pilot.steady_flux, pilot.unshadowed

@@ -50,7 +50,7 @@ def better_estimate(seen: PilotFlux) -> tuple[NDArray[np.float32], NDArray[np.fl
     return flux, np.where(controlled, seen.controlled_scatter, seen.plain_scatter)
 
 
-def _turns(sites: Sites, place: NDArray[np.int64], count: int) -> Iterator[NDArray[np.bool_]]:
+def _turns(sites: Sites, place: NDArray[np.int64], count: int, stride: int) -> Iterator[NDArray[np.bool_]]:
     """Windows in which each set of rays looks at the sites at some places, [window, place]; the first one always."""
     if sites.board is None:
         # two sets, so that what one misses is seen a window later
@@ -60,8 +60,9 @@ def _turns(sites: Sites, place: NDArray[np.int64], count: int) -> Iterator[NDArr
             yield turn
         return
     # the fields of a chequered board; which of them is the sequence of Thue and Morse, with which no motion keeps pace
-    which = np.array([window.bit_count() % 2 for window in range(count)], np.bool_)
+    which = np.array([(window // stride).bit_count() % 2 for window in range(count)], np.bool_)
     turn = which[:, None] ^ sites.board.odd[place]
+    turn[np.arange(count) % stride > 0] = False
     # what comes between the last look of few rays and that of all would go unseen
     turn[[0, count - 2]], turn[-1] = True, False
     yield turn
@@ -78,13 +79,14 @@ def windows_with_changes(
     width_px: float,
     mild: bool = False,
     shadows: NDArray[np.uint32] | None = None,
+    stride: int = 1,
 ) -> NDArray[np.bool_]:
     """Windows between the first and the last one in which the pilot looks with all its rays, [window, site].
 
     Few rays look at sites that are even in the first window: where pixels lie on no lattice in each window, by two
-    sets of rays in turn, else by one set in about every second window of a site. The pilot looks where they differ from
-    what they saw last, or among each other, and in the windows before and after. Sites that are not even in the first
-    window are looked at in all windows.
+    sets of rays in turn, else by one set, at a site or at those beside it, in every `stride`-th window. The pilot
+    looks where they differ from what they saw last, or among each other, and in the windows before and after. Sites
+    that are not even in the first window are looked at in all windows.
 
     Parameters
     ----------
@@ -98,6 +100,7 @@ def windows_with_changes(
     width_px : width of the area in which the rays start, px.
     mild : take the mild scatter, see `PilotFlux`.
     shadows : [site], known shadows, see `PairTracer.trace`; None for none.
+    stride : windows in which nothing moves by more than a pixel, a power of two.
     """
     count, size = numbers.shape
     most = _EVEN * _MILD if mild else _EVEN
@@ -106,7 +109,7 @@ def windows_with_changes(
     place = np.flatnonzero(even)
     # [window, site]; `seen` where few rays have looked
     new, seen = np.zeros((2, count, size), np.bool_)
-    for number, turn in enumerate(_turns(sites, place, count)):
+    for number, turn in enumerate(_turns(sites, place, count, stride)):
         window, column = np.nonzero(turn)
         site = place[column]
         got = tracer.pilot(

@@ -98,8 +98,8 @@ class ChangeDrivenFlux:
         most_power = 1.0 if light is None else light.highest
         self.is_static = not tracer.parts.groups and tracer.camera is None
         noise = Noise(self.sensor, most_power, rests=self.is_static)
-        self._renderer = AdaptiveRenderer(tracer, noise, quality, tuning.at(quality))
         self._clock = MotionClock(self.view, tracer.camera, tracer.parts.groups, partial(least_depth_m, tracer))
+        self._renderer = AdaptiveRenderer(tracer, noise, quality, tuning.at(quality), self._clock)
         self._index = self._renderer.index
         #: References of the audit; a small run asks for the same pairs again and again.
         self._known: dict[tuple[Role, float], KnownPairs] = {}

@@ -150,6 +150,7 @@ def take_pilot(
     stride: int = 1,
     wanted: Wanted | None = None,
     mild: bool = False,
+    few_stride: int = 1,
 ) -> tuple[Pilot, NDArray[np.bool_]]:
     """Trace the pilot pass.
 
@@ -166,6 +167,7 @@ def take_pilot(
     stride : number of windows from one look to the next; between two looks that show the same, nothing is traced.
     wanted : maps the flux of each site to the wanted error of a pair, both e⁻/s; needed where `stride` is above 1.
     mild : take the mild scatter, see `PilotFlux`.
+    few_stride : number of windows from one look of few rays to the next, see `windows_with_changes`.
 
     Returns
     -------
@@ -216,7 +218,7 @@ def take_pilot(
         if stride == 1 and rays > DETECTOR_RAYS and wanted is not None and count > 2:
             # few rays tell which windows show anything new
             of = tracer, sites, numbers, windows, first, near, wanted, width_px, mild
-            looks.wherever(windows_with_changes(*of, shadows[0]))
+            looks.wherever(windows_with_changes(*of, shadows[0], few_stride))
         else:
             looks.every(stride, sites, wanted)
     tables = [looks.tables[name] for name in STATISTICS]

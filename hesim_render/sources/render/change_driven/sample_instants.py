@@ -22,6 +22,8 @@ LEAST_US = 10
 #: Cells for which distances are taken together, and the part of a distance that is relied on: between the rays that
 #: measure how far the scene is, something may be nearer.
 _CELLS, _SURE = 16, 0.5
+#: Largest number of ticks from one look of few rays to the next: with 8, no fewer rays were left to save.
+_MOST_WINDOWS = 4
 #: Least depth of an object that is assumed, as a part of its distance from the camera.
 _NEAREST = 0.05
 
@@ -64,6 +66,8 @@ class MotionClock:
         if view.projection.distortion is not None:
             _, self._stretch, self._turned = view.projection.distortion.steepest
         self._speed_of = method_cache(self._per_metre, maxsize=1024)
+        #: All bands of a block ask for the same.
+        self.windows_of_a_pixel = method_cache(self._windows_of_a_pixel, maxsize=16)
 
     def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
         """Instants from `begin_us` to `end_us`, both included, in whole µs; multiples of `CELL_US` are among them."""
@@ -75,17 +79,29 @@ class MotionClock:
 
     def _cell(self, number: int) -> NDArray[np.int64]:
         begin, end = number * CELL_US, (number + 1) * CELL_US
-        pieces = ceil(self._motion_px(begin, end) / STEP_PX - 1e-9)
+        pieces = ceil(self.motion_px(begin, end) / STEP_PX - 1e-9)
         pieces = max(1, min(pieces, CELL_US // LEAST_US))
         return np.rint(np.linspace(begin, end, pieces + 1)).astype(np.int64)
 
-    def _motion_px(self, begin_us: float, end_us: float) -> float:
-        """Upper bound of the motion of anything in the image within a cell, pixels."""
+    def _windows_of_a_pixel(self, begin_us: float, end_us: float, windows: int) -> int:
+        """Number of windows within which nothing moves by more than a pixel, a power of two, where an interval has so
+        many.
+        """
+        each_px, within = self.motion_px(begin_us, end_us) / max(1, windows), 1
+        while within < _MOST_WINDOWS and 2 * within * each_px <= 1:
+            within *= 2
+        return within
+
+    def motion_px(self, begin_us: float, end_us: float) -> float:
+        """Upper bound of the motion of anything in the image within an interval, pixels."""
         turn, shift = 0.0, 0.0
         if self._camera is not None:
             turn = fastest_turn_rad_per_s(self._camera, begin_us, end_us)
             shift = fastest_m_per_s(self._view.camera_to_world[None, :3, 3], self._camera, begin_us, end_us)
-        resting, nearest = self._speed_of(int(begin_us // (CELL_US * _CELLS)))
+        some_us = CELL_US * _CELLS
+        first = int(begin_us // some_us)
+        every = [self._speed_of(k) for k in range(first, max(first + 1, ceil(end_us / some_us)))]
+        resting, nearest = max(one for one, _ in every), np.max([own for _, own in every], axis=0)
         fastest = turn * self._turned + shift * resting
         for group, per_metre in zip(self._groups, nearest, strict=True):
             own = fastest_m_per_s(group.corners, group.trajectory, begin_us, end_us)
