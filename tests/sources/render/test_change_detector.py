@@ -72,7 +72,7 @@ def wanted_error(flux):
     return np.where(flux > 796, WANTED * flux / 800, np.where(flux > 600, 4, 3)).astype(np.float32)
 
 
-def found_by(light, sites=None, first=(35.4, 42.0), near=True, spread=None, mild=False):
+def found_by(light, sites=None, first=(35.4, 42.0), near=True, spread=None, mild=False, stride=1):
     sites = Sites.alone(np.arange(light.shape[1], dtype=np.uint32)) if sites is None else sites
     tracer, seen = Detected(light, spread=spread), PilotFlux.empty(sites.size)
     seen.controlled[:], seen.plain[:] = 800, 805
@@ -80,7 +80,8 @@ def found_by(light, sites=None, first=(35.4, 42.0), near=True, spread=None, mild
     numbers = np.repeat(np.arange(COUNT)[:, None], sites.size, axis=1)
     windows = Windows(np.arange(COUNT) * 4.0, np.arange(COUNT) * 4.0 + 3)
     near = np.ones(sites.size, bool) & near
-    marked = windows_with_changes(tracer, sites, numbers, windows, seen, near, wanted_error, 1.6, mild)
+    given = tracer, sites, numbers, windows, seen, near, wanted_error, 1.6, mild
+    marked = windows_with_changes(*given, stride=stride)
     return tracer, sorted(zip(*(each.tolist() for each in np.nonzero(marked)), strict=True))
 
 
@@ -202,6 +203,34 @@ def test_what_a_site_misses_its_neighbours_see():
     _, found = found_by(light_of(15, s8=(4, COUNT, 90.0)), sites, near=np.arange(15) != 3)
     assert windows_of(found, 8) == [2, 3, 4, 5] and 3 not in windows_of(found, 12) and not windows_of(found, 3)
     assert 4 in windows_of(found, 7)
+
+
+@pytest.mark.parametrize("stride", [2, 4])
+def test_where_things_move_slowly_few_rays_look_less_often(stride):
+    """In every second or fourth window a site or the four beside it are looked at; what came since is a suspect."""
+    tracer, _ = found_by(light_of(15), board(), stride=stride)
+    looked = np.zeros((COUNT, 15), bool)
+    for *_, window, index in tracer.traced:
+        looked[window, index] = True
+    windows = np.flatnonzero(looked.any(axis=1)).tolist()
+    assert windows == ([0, 2, 4, 6, 8] if stride == 2 else [0, 4, 8])
+    assert looked[0].all() and looked[8].all()
+    fields = looked[windows[1:-1]].reshape(-1, 3, 5)
+    assert np.all(fields[:, 1:] ^ fields[:, :-1]) and np.all(fields[:, :, 1:] ^ fields[:, :, :-1])
+    # the sequence of Thue and Morse over the steps: 1, 1, 0 for the fields that begin
+    own = [w for w in windows if looked[w, 7]]
+    assert own == ([0, 6, 8] if stride == 2 else [0, 8])
+    _, found = found_by(light_of(15, s7=(5, COUNT, 90.0)), board(), stride=stride)
+    assert windows_of(found, 7) == ([1, 2, 3, 4, 5, 6, 7] if stride == 2 else list(range(1, COUNT - 1)))
+
+
+@pytest.mark.parametrize(("few_stride", "inner"), [(1, [1, 2, 3, 4, 5, 6, 7]), (2, [2, 4, 6]), (4, [4])])
+def test_the_pilot_says_how_often_few_rays_look(few_stride, inner):
+    tracer, sites = Detected(light_of(15)), board()
+    numbers = np.repeat(np.arange(COUNT)[:, None], 15, axis=1)
+    windows = Windows(np.arange(COUNT) * 4.0, np.arange(COUNT) * 4.0 + 3)
+    take_pilot(tracer, sites, windows, numbers, 16, 1.6, None, wanted=wanted_error, few_stride=few_stride)
+    assert sorted({window for window, _ in tracer.looked(8)} - {0, 8}) == inner
 
 
 def pilot_by(tracer, rays, anchored=None, known=None, span_us=None, stride=1, mild=False):

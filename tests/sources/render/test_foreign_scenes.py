@@ -788,3 +788,12 @@ def test_a_sliding_camera_is_followed_by_half_of_the_least_distance_at_three_tim
     # between the three times the camera may come nearer by what it moves in a quarter of the interval, at 1 m/s
     depth = 3.0 - 0.25e-6 * span_us
     assert own == pytest.approx(stretch / depth, rel=1e-6)
+    # an interval over two sixteens of cells has the larger bound of both, which is that of the later one
+    fastest = max(resting, own)
+    px_per_m = clock._px_per_rad
+    assert clock.motion_px(2.5 * span_us, 2.75 * span_us) == pytest.approx(0.25e-6 * span_us * fastest * px_per_m)
+    assert clock.motion_px(1.75 * span_us, 2.25 * span_us) == pytest.approx(0.5e-6 * span_us * fastest * px_per_m)
+    # windows within which nothing moves by more than a pixel: of 0.12 to 0.51 pixels each
+    for each_px, windows in ((0.12, 4), (0.24, 4), (0.26, 2), (0.49, 2), (0.51, 1)):
+        many = 0.5e-6 * span_us * fastest * px_per_m / each_px
+        assert clock.windows_of_a_pixel(1.75 * span_us, 2.25 * span_us, many) == windows

@@ -70,19 +70,22 @@ def about_edges(
     fit.replace(new, tracer.edges(*of, stream, moves, None if shadows is None else shadows[some]))
     contrast = (fit.high - fit.low) / wanted
     is_edge = fit.is_edge & (contrast >= 1)
-    # both sides belong to the scatter of a pair that has no edge
-    by_scatter = gain.rays(np.where(is_edge, 0, 0.5 * contrast) + fit.scatter / wanted)
+    # both sides belong to the scatter of a pair that has no edge; of few rays, the rarer side may have two more in 68
+    share = (fit.fewer + 2) / (fit.rays + 4)
+    between = np.where(is_edge, 0, np.sqrt(share * (1 - share)) * contrast)
+    by_scatter = gain.rays(between + fit.scatter / wanted)
+    # what moves within the window passes by more of the decision rays than a sliver that rests, so these tell enough
     is_flat = ~is_edge & ((contrast < tuning.low_contrast) | moves)
     # an edge: its contrast says how much a ray weighs that finds the model wrong; half of the rays start in the strip
     per_contrast = tuning.moving_contrast_rays if moves else tuning.edge_contrast_rays
     needed = np.where(is_edge, np.maximum(2 * by_scatter, per_contrast * contrast), by_scatter)
-    # little contrast: the neighbours gave this pair its rays, and what they show does not reach it
+    # the neighbours gave this pair its rays, and what they show does not reach it
     part = tuning.flat_part if flat_part is None else flat_part
     needed = np.where(is_flat, np.maximum(needed, part * rays[place].astype(np.float32)), needed)
     least = np.where(is_flat, tuning.edge_rays // 2, tuning.edge_rays)
     needed = np.clip(np.maximum(needed, floor[place]), least, tuning.most_rays)
     fewer = 1 << np.ceil(np.log2(needed)).astype(np.int64)
-    # all other pairs, such as corners and penumbrae, keep the rays of the law
+    # all other pairs, such as corners and penumbrae of short windows, keep the rays of the law
     pays = (is_edge | is_flat) & (fewer < rays[place])
     out = rays.copy()
     out[place[pays]] = fewer[pays]
