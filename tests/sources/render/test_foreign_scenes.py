@@ -795,5 +795,5 @@ def test_a_sliding_camera_is_followed_by_half_of_the_least_distance_at_three_tim
     assert clock.motion_px(1.75 * span_us, 2.25 * span_us) == pytest.approx(0.5e-6 * span_us * fastest * px_per_m)
     # windows within which nothing moves by more than a pixel: of 0.12 to 0.51 pixels each
     for each_px, windows in ((0.12, 4), (0.24, 4), (0.26, 2), (0.49, 2), (0.51, 1)):
-        many = 0.5e-6 * span_us * fastest * px_per_m / each_px
-        assert clock.windows_of_a_pixel(1.75 * span_us, 2.25 * span_us, many) == windows
+        long_us = 0.25 * span_us, 9.5 * span_us
+        assert clock.windows_of_a_pixel(*long_us, clock.motion_px(*long_us) / each_px) == windows
