@@ -5,7 +5,7 @@
 Each row is a run of `hesim-render simulate` in a process of its own, in the default mode with its audit: a reference
 with other random numbers, which says by how many noise units event pixels deviate, and how many of its events the run
 misses. Rows that take hours are forecast only, by `--dry-run`; `--forecast` forecasts all. Times are of this machine,
-rays are the same on all. Nothing was tuned on the rows marked with *. The last four are Mitsuba XML with light that
+rays are the same on all. Nothing was tuned on the rows marked with *. The last five are Mitsuba XML with light that
 bounces, 64×48 pixels of it (`benchmarks/scenes`).
 """
 
@@ -36,7 +36,7 @@ ROWS = {
     "glass": ("glass-and-metal", "davis346", 0.02, False),
     **{
         f"{name}*": (str(SCENES / f"{name}.yaml"), "davis346", 0.02, True)
-        for name in ("room", "floor-ball", "copper", "glass-ball")
+        for name in ("room", "floor-ball", "sky-knot", "copper", "glass-ball")
     },
 }
 
