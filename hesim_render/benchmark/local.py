@@ -57,11 +57,6 @@ class LocalWorkers:
         self._waits = selectors.DefaultSelector()
         self._workers: list[_Worker] = []
 
-    @property
-    def pids(self) -> list[int]:
-        """Numbers of the processes that run now."""
-        return [worker.process.pid for worker in self._workers]
-
     def _start(self) -> _Worker:
         process = subprocess.Popen(
             COMMAND, env=child_environment(),
