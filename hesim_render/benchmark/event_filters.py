@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-#: The support time, within which the event of a neighbour counts, µs.
+#: Default time within which a neighbour supports an event, µs.
 SUPPORT_US = 5000
 _LONG_AGO = np.iinfo(np.int64).min // 2
 
@@ -54,31 +54,32 @@ def _newest(events: NDArray, shape: tuple[int, int], steps: list[tuple[int, int]
     return newest
 
 
-def nearest_neighbour(events: NDArray, shape: tuple[int, int]) -> NDArray[np.bool_]:
+def nearest_neighbour(events: NDArray, shape: tuple[int, int], support_us: int = SUPPORT_US) -> NDArray[np.bool_]:
     """Keep an event [event] if one of its 4 neighbours had an event of any polarity within the support time.
 
     Parameters
     ----------
     events : structured array of `EVENT_DTYPE`, in order of time.
     shape : rows and columns of the event grid.
+    support_us : the support time, µs.
     """
     steps = [(-1, 0), (1, 0), (0, -1), (0, 1)]
-    return events["t_us"] - _newest(events, shape, steps) <= SUPPORT_US
+    return events["t_us"] - _newest(events, shape, steps) <= support_us
 
 
-def background_activity(events: NDArray, shape: tuple[int, int]) -> NDArray[np.bool_]:
+def background_activity(events: NDArray, shape: tuple[int, int], support_us: int = SUPPORT_US) -> NDArray[np.bool_]:
     """Keep an event if one of its 8 neighbours had an event of any polarity within the support time [delbruck2008].
 
     Parameters
     ----------
-    events, shape : as for `nearest_neighbour`.
+    events, shape, support_us : as for `nearest_neighbour`.
 
     Returns
     -------
     [event], True for the kept ones.
     """
     steps = [(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1) if (row, col) != (0, 0)]
-    return events["t_us"] - _newest(events, shape, steps) <= SUPPORT_US
+    return events["t_us"] - _newest(events, shape, steps) <= support_us
 
 
 FILTERS: dict[str, Callable[[NDArray, tuple[int, int]], NDArray[np.bool_]]] = {
