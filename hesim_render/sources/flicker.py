@@ -114,6 +114,7 @@ class FlickerFlux:
             # computed for whole cells, so that the result does not depend on the interval
             bright = self._follow_us(low, high)
             motion = self.sources[0].sample_times_us(low, high) if bright.size else bright
+            # between cuts of either kind one of both hardly changes: the product of means holds, and the fewer are taken
             cuts += [min(bright, motion, key=len), np.array([high], np.float64)]
         every = np.unique(np.concatenate(cuts))
         return every[(every > begin_us) & (every < end_us)]
@@ -179,6 +180,7 @@ class FlickerFlux:
                 for weights in np.stack(self._weights(begin, end), axis=1):
                     yield Sample(*_weighted(halves, list(weights)), np.zeros(pixels.size, np.float32))
             return
+        # each source is asked for the pieces of all windows in one stream; the sums take them up in the same order
         mine, *others = itertools.tee(map(self._cut, blocks), 1 + len(self.sources))
         streams = []
         for source, cut in zip(self.sources, others, strict=True):
@@ -188,6 +190,7 @@ class FlickerFlux:
             begin, end = pieces.begin_us[pieces.wanted], pieces.end_us[pieces.wanted]
             weights = np.stack(self._weights(begin, end), axis=1)
             for first, count in zip(np.cumsum(counts) - counts, counts, strict=True):
+                # weight of a piece: mean power in it, times its share of the window
                 length = end[first + count - 1] - begin[first]
                 share = (end - begin)[first : first + count] / length if length > 0 else np.ones(1)
                 yield self._sum([next(samples) for _ in range(count)], weights[first : first + count] * share[:, None])
