@@ -90,9 +90,9 @@ class _Pixel:
             chances = [formulas.leak_probability(hz, tick_s) for hz in self.noise.comparator_noise_hz]
             free = (1 - on - off) * (1 - leak)
             return (on + (1 - on - off) * leak + free * chances[0]) / tick_s, (off + free * chances[1]) / tick_s
-        assert self.spec.photoreceptor_cutoff_hz is not None
+        assert self.spec.noise_cutoff_hz is not None
         dead_s = (self.noise.refractory_period_us or 0) * S_PER_US
-        bandwidth_hz = share * self.spec.photoreceptor_cutoff_hz
+        bandwidth_hz = share * self.spec.noise_cutoff_hz
         own = self.noise.comparator_noise_hz
         resets_hz = leak_hz + sum(own)
         on, off = noise_rates_hz(self.thresholds, self.mismatch, math.sqrt(variance), bandwidth_hz, dead_s, resets_hz)
@@ -103,8 +103,8 @@ class _Pixel:
         flux = np.maximum(lux * self.flux, 1e-30)
         if self.spec.reference == "previous_sample":
             return np.sqrt(1 / (flux * self.spec.window_us * S_PER_US))
-        assert self.spec.photoreceptor_cutoff_hz is not None
-        pole_hz = self.level(lux)[2] * self.spec.photoreceptor_cutoff_hz * POLE_HZ
+        assert self.spec.noise_cutoff_hz is not None
+        pole_hz = self.level(lux)[2] * self.spec.noise_cutoff_hz * POLE_HZ
         return np.sqrt(math.pi / 2 * pole_hz / flux)
 
     def latency(self, lux: float, step: float) -> float:

@@ -114,7 +114,7 @@ class FlickerFlux:
             # computed for whole cells, so that the result does not depend on the interval
             bright = self._follow_us(low, high)
             motion = self.sources[0].sample_times_us(low, high) if bright.size else bright
-            # between cuts of either kind one of both hardly changes: the product of means holds, and the fewer are taken
+            # between cuts of either kind one of both hardly changes: the product of means holds. The fewer are taken
             cuts += [min(bright, motion, key=len), np.array([high], np.float64)]
         every = np.unique(np.concatenate(cuts))
         return every[(every > begin_us) & (every < end_us)]
