@@ -1,4 +1,7 @@
-"""Worker processes on this machine: they take units of work one by one, and a dead one is replaced."""
+"""Worker processes on this machine: they take units of work one by one, and a dead one is replaced.
+
+A pool of `concurrent.futures` ends with the first process that dies, and does not say at which unit it died.
+"""
 
 import contextlib
 import json

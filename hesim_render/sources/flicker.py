@@ -125,12 +125,12 @@ class FlickerFlux:
         """Sum of each source's mean times the mean of its waveform. Sources without power in the interval are not
         asked.
         """
-        lit = [number for number, weight in enumerate(weights) if np.any(weight)]
-        halves = [self.sources[number].mean_flux(pixel, begin, end) for number in lit]
-        if not lit:
+        powered = [number for number, weight in enumerate(weights) if np.any(weight)]
+        halves = [self.sources[number].mean_flux(pixel, begin, end) for number in powered]
+        if not powered:
             types = jit()
             return types.Float(np.zeros(pixel.size, np.float32)), types.Float(np.zeros(pixel.size, np.float32))
-        return _weighted(halves, [weights[number] for number in lit])
+        return _weighted(halves, [weights[number] for number in powered])
 
     def _pieces(self, pixel: NDArray[np.uint32], begin: NDArray, end: NDArray, bounds: NDArray[np.float64]) -> Halves:
         """As `_piece`, piece by piece. A pixel takes part in the pieces that overlap its interval."""
@@ -263,9 +263,9 @@ class FlickerFlux:
         assert self._is_whole
         total = np.zeros((2, pixel.size))
         for source, weight in zip(self._auditable, self._weights(begin_us, end_us), strict=True):
-            lit = np.flatnonzero(weight)
-            result = source.reference_flux(pixel[lit], begin_us[lit], end_us[lit], quality, events)
-            total[:, lit] += weight[lit] * result
+            powered = np.flatnonzero(weight)
+            result = source.reference_flux(pixel[powered], begin_us[powered], end_us[powered], quality, events)
+            total[:, powered] += weight[powered] * result
         return total
 
 

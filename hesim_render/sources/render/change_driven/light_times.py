@@ -59,15 +59,15 @@ class LightParts:
         tilt = np.divide(2 * (late - early), power, out=np.zeros_like(power), where=power > 0)
         # energy of each window, by which the energies of its parts become shares
         total = np.add.reduceat(power * length, first)
-        is_lit = (total > 0)[window]
+        has_energy = (total > 0)[window]
         # of a dark or empty window the first part is all of it: any instant will do, its power is 0 or its length is
-        energy = np.where(is_lit, power * length / np.where(is_lit, total[window], 1), place == 0)
-        length = np.where(is_lit, length, (end_us - begin_us)[window])
+        energy = np.where(has_energy, power * length / np.where(has_energy, total[window], 1), place == 0)
+        length = np.where(has_energy, length, (end_us - begin_us)[window])
         before = np.cumsum(energy) - energy
         before -= before[first][window]
         # the search for an instant must not end in a part without energy
         last = np.maximum.reduceat(np.where(energy > 0, np.arange(window.size), 0), first)
-        tilt = np.where(is_lit, np.clip(tilt, -2, 2), 0)
+        tilt = np.where(has_energy, np.clip(tilt, -2, 2), 0)
         return cls(first, last, before, energy, left - begin_us[window], length, tilt)
 
 

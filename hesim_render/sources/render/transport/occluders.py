@@ -95,7 +95,7 @@ def by_box(
     per_volume = dr.rcp(volume)
     # place of the point between the faces of each pair
     places = [-dr.dot(each, relative) * per_volume for each in across]
-    hidden, is_outside = kind(0.0), type(volume > 0)(False)
+    occluded, is_outside = kind(0.0), type(volume > 0)(False)
     has_all = top > 0
     for axis in range(3):
         # a face is seen from its outer side only, so at most one of each pair
@@ -116,8 +116,8 @@ def by_box(
             return _edges_within(own, inward, own_weights, planes) + _edges_within(lamp, planes, weights, inward)
 
         part = dr.if_stmt((base, first, second, sign), faces, face, lambda *_: kind(0.0), label="face")
-        hidden += part
-    return 0.5 * hidden, is_outside
+        occluded += part
+    return 0.5 * occluded, is_outside
 
 
 def _edges_within(
