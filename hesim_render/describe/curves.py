@@ -111,12 +111,14 @@ class _Pixel:
         """µs from a step up to the event."""
         before, after = (float(self.level(value)[0]) for value in (lux, lux * (1 + step)))
         spec, theta = self.noise.photoreceptor, self.thresholds[0]
+        # a step below the threshold gives no event
         if after - before <= theta:
             return math.nan
         # at a fixed tick the step falls anywhere in it
         sampling = 0.5 * self.spec.tick_us if self.spec.reference == "previous_sample" and self.spec.tick_us else 0.0
         if spec is None:
             return sampling
+        # the pixel settles with the corner that it has in the light after the step
         corner = spec.cutoff_hz
         if spec.follows_light:
             electrons = np.asarray(lux * (1 + step) * self.flux * (self.spec.window_us * S_PER_US))
