@@ -20,7 +20,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Halves
 from hesim_render.mosaic.schedule import CELL_US, Block, blocks_of_run
-from hesim_render.sources.protocol import AuditableFlux, FluxSource, Sample
+from hesim_render.sources.protocol import AuditableFlux, FluxSource, Sample, WeightedFlux
 from hesim_render.sources.still import Kept
 from hesim_render.spectral.waveform import Waveform
 
@@ -34,8 +34,8 @@ class FlickerFlux:
     Parameters
     ----------
     waveforms : waveform of each source; None is steady.
-    sources : sources with the same geometry and camera. One whose attribute `light` is its waveform weights its means
-        over intervals with that waveform itself.
+    sources : sources with the same geometry and camera. A `WeightedFlux` of its waveform weights its means over
+        intervals itself.
     window_us : length of the window in which event pixels integrate, µs.
 
     Attributes
@@ -52,7 +52,7 @@ class FlickerFlux:
         self.is_static = False
         self._still = Kept(self.sources) if first.is_static else None
         self._is_whole = all(
-            waveform is None or getattr(source, "light", None) is waveform
+            waveform is None or (isinstance(source, WeightedFlux) and source.light is waveform)
             for waveform, source in zip(self._waveforms, self.sources, strict=True)
         )
 
