@@ -25,6 +25,7 @@ from hesim_render.recording.recording import Recording
 from hesim_render.recording.showcase import binned
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.specs import SensorSpec, read_scene
+from hesim_render.spectral.spectrum import illuminant
 
 ROOT = Path(__file__).parents[2]
 SENSORS = ("eiger", "gen2", "mipi-hybridevs", "davis346", "reference-mono", "reference-bayer")
@@ -418,3 +419,15 @@ def test_manifest_knows_the_files_of_lights_charts_and_mitsuba_scenes(scene, fil
     (tmp_path / "s.yaml").write_text(f"schema_version: 1\nname: s\ndescription: files\n{scene}")
     hashes = manifests._file_hashes(read_scene(tmp_path / "s.yaml"))
     assert hashes == {name: hashlib.sha256(text.encode()).hexdigest() for name, text in files.items()}
+
+
+def test_white_is_that_of_lamps_where_nothing_else_shines():
+    sensor, given = hr.load_sensor("eiger").crop(16, 16), {"seed": 1, "duration_us": 10, "settings": {"clean": True}}
+    scene = read_scene("integrating-sphere", {"light": {"type": "none"}, "target.illuminant": "A"})
+    neutral = manifests.build(sensor, scene=scene, **given)["mosaic"]["neutral"]
+    assert neutral == describe(sensor, illuminant("A")).neutral
+    assert neutral != manifests.build(sensor, scene=None, **given)["mosaic"]["neutral"]
+    # a light of the scene comes first
+    light = {"type": "uniform", "illuminance_lux": 9, "illuminant": "A"}
+    scene = read_scene("integrating-sphere", {"light": light, "target.illuminant": "D65"})
+    assert manifests.build(sensor, scene=scene, **given)["mosaic"]["neutral"] == neutral
