@@ -50,7 +50,7 @@ def simulated(lux, span_s, bins_hz, devices, seed=1):
         "evs.tick_us": None, "evs.window_us": 1000, "evs.contrast_threshold_on": theta,
         "evs.contrast_threshold_off": theta * fitted["off"], "evs.threshold_mismatch_rel": 0.0,
         "evs.signal_reference": {"k_dn_per_e": 1.0, "t_ref_us": 1000.0, "filter": "own"}, "evs.coefficients": [beta],
-        "evs.shot_law": "sqrt", "evs.photoreceptor_cutoff_hz": fitted["bandwidth_hz"], "evs.leak": leak,
+        "evs.shot_law": "sqrt", "evs.noise_cutoff_hz": fitted["bandwidth_hz"], "evs.leak": leak,
         "evs.refractory_period_us": DEAD_US,
         "evs.noise_spread": {"bandwidth_rel": fitted["bandwidth_rel"], "odd_rows_rel": fitted["rows"]},
     })  # fmt: skip

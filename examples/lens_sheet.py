@@ -62,12 +62,12 @@ PICTURES = {
     ),
     "lateral_chromatic: 3 %": (
         2.8,
-        {"lateral_chromatic": {"wavelength_nm": [420, 540, 660], "relative": [-0.03, 0, 0.03]}},
+        {"lateral_chromatic": {"wavelength_nm": [420, 540, 660], "magnification_rel": [-0.03, 0, 0.03]}},
     ),
     "relative_illumination: none": (2.8, {"relative_illumination": "none"}),
     "relative_illumination: table": (
         2.8,
-        {"relative_illumination": {"image_height_mm": [0, 1, 2, 3], "relative": [1.0, 0.8, 0.4, 0.1]}},
+        {"relative_illumination": {"image_height_mm": [0, 1, 2, 3], "illumination_rel": [1.0, 0.8, 0.4, 0.1]}},
     ),
     "veiling_glare: 0.4": (2.8, {"veiling_glare": 0.4}),
 }

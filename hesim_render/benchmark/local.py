@@ -1,4 +1,7 @@
-"""Worker processes on this machine: they take units of work one by one, and a dead one is replaced."""
+"""Worker processes on this machine: they take units of work one by one, and a dead one is replaced.
+
+A pool of `concurrent.futures` ends with the first process that dies, and does not say at which unit it died.
+"""
 
 import contextlib
 import json
@@ -56,11 +59,6 @@ class LocalWorkers:
         self._threads = max(1, processors() // count)
         self._waits = selectors.DefaultSelector()
         self._workers: list[_Worker] = []
-
-    @property
-    def pids(self) -> list[int]:
-        """Numbers of the processes that run now."""
-        return [worker.process.pid for worker in self._workers]
 
     def _start(self) -> _Worker:
         process = subprocess.Popen(

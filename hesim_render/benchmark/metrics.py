@@ -148,10 +148,12 @@ def nearest_us(asked: NDArray, given: NDArray, shape: tuple[int, int]) -> NDArra
         return np.full(len(asked), np.inf)
     begin = int(min(asked["t_us"].min(), given["t_us"].min()))
     span = int(max(asked["t_us"].max(), given["t_us"].max())) - begin + 1
+    # pixel, polarity and time in one number, so that one sort serves all pixels
     keys = np.sort(_place(given, shape) * span + (given["t_us"] - begin))
     place, time = _place(asked, shape), asked["t_us"] - begin
     after = np.searchsorted(keys, place * span + time)
     offset_us = np.full((2, len(asked)), np.inf)
+    # the neighbours before and after, where they are of the same pixel and polarity
     for row, index in enumerate((after - 1, after)):
         inside = (index >= 0) & (index < len(keys))
         key = keys[np.clip(index, 0, len(keys) - 1)]

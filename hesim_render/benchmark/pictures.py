@@ -71,6 +71,7 @@ class ClipDevelopment:
         row_of, every = places[:, 0] // cols, np.arange(cols)
         along = np.stack([np.interp(every, p % cols, v) for p, v in zip(places, events_map, strict=True)])
         at = np.interp(np.arange(rows), row_of, np.arange(len(row_of)))
+        # between two rows of event pixels; beyond the first and the last, their values
         low = np.minimum(at.astype(np.int64), max(0, len(row_of) - 2))
         weight = (at - low)[:, None]
         return (1 - weight) * along[low] + weight * along[np.minimum(low + 1, len(row_of) - 1)]
@@ -87,6 +88,7 @@ class ClipDevelopment:
         given: NDArray[np.bool_] = np.asarray(np.isfinite(flow).all(axis=-1))
         known: NDArray[np.float64] = np.where(given[..., None], flow, 0.0) * pitch
         result = np.stack([self.on_mosaic(known[..., k]) for k in range(2)], axis=-1)
+        # half of the weight must come from pixels with a flow
         near = self.on_mosaic(given.astype(np.float64)) >= 0.5
         return np.where(near[..., None], result, np.nan)
 

@@ -197,8 +197,8 @@ def write_colours(
         for name in ("flux_e_per_s", "stderr_e_per_s"):
             file.create_dataset(name, shape, "f4", chunks=(1, *shape[1:3], 1), compression=COMPRESSION)
         for channel, seen_by in enumerate(names):
-            lit, one = in_absolute_light(scene)[0], through_one_filter(sensor, seen_by)
-            source = scene_renderer(lit, one, seed + 1 + channel, quality)
+            absolute, one = in_absolute_light(scene)[0], through_one_filter(sensor, seen_by)
+            source = scene_renderer(absolute, one, seed + 1 + channel, quality)
             for number, (_, begin) in enumerate(times):
                 first = begin[every // sensor.cols]
                 a, b = (np.array(half) for half in source.mean_flux(every, first, first + spec.window_us))

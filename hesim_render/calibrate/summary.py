@@ -22,7 +22,7 @@ _EVS = {
     "threshold_mismatch_rel": "threshold mismatch",
     "leak_per_trial": "leak per trial",
     "leak_rate_hz": "leak",
-    "photoreceptor_cutoff_hz": "noise bandwidth",
+    "noise_cutoff_hz": "noise bandwidth",
 }
 
 

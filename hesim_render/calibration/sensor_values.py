@@ -174,7 +174,7 @@ def _asynchronous_values(sensor: Mapping[str, Any], evs: AsynchronousSection, fi
         "coefficients": [beta],
         "shot_law": evs.shot_law,
         "leak_rate_hz": max(0.0, _needed(evs.leak_rate_hz, "evs.leak_rate_hz", file)),
-        "photoreceptor_cutoff_hz": _needed(evs.photoreceptor_cutoff_hz, "evs.photoreceptor_cutoff_hz", file),
+        "noise_cutoff_hz": _needed(evs.noise_cutoff_hz, "evs.noise_cutoff_hz", file),
     }
 
 

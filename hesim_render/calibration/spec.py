@@ -215,7 +215,7 @@ class AsynchronousSection(_Section):
     threshold_mismatch_rel: EstimateSpec
     threshold_mismatch_on_rel: EstimateSpec
     threshold_mismatch_off_rel: EstimateSpec
-    photoreceptor_cutoff_hz: EstimateSpec
+    noise_cutoff_hz: EstimateSpec
     leak_rate_hz: EstimateSpec
     noise: list[NoiseInLight] = []
     goodness: AsynchronousGoodness

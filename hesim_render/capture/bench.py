@@ -192,7 +192,7 @@ def _events(evs: EvsNoise) -> dict[str, float]:
             result["leak_per_trial"] = -math.expm1(-rate_hz * spec.tick_us * S_PER_US)
     if spec.reference == "last_event":
         if spec.photoreceptor is None or not spec.photoreceptor.filters_noise:
-            result["photoreceptor_cutoff_hz"] = float(spec.photoreceptor_cutoff_hz or 0.0)
+            result["noise_cutoff_hz"] = float(spec.noise_cutoff_hz or 0.0)
         return result
     every = {(c.beta1, c.beta2, c.beta3, c.beta4, c.beta5) for c in spec.coefficients}
     if len(every) == 1 and not off & {"shot", "dark_current"}:

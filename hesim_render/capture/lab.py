@@ -236,8 +236,8 @@ class _Session:
 
     def work_of(self, duration_s: float) -> float:
         """What trials of asynchronous pixels cost, in ticks."""
-        assert self.bench.evs is not None and self.bench.evs.spec.photoreceptor_cutoff_hz is not None
-        return duration_s * _NODES_PER_CUTOFF_PERIOD * self.bench.evs.spec.photoreceptor_cutoff_hz
+        assert self.bench.evs is not None and self.bench.evs.spec.noise_cutoff_hz is not None
+        return duration_s * _NODES_PER_CUTOFF_PERIOD * self.bench.evs.spec.noise_cutoff_hz
 
     def write_trials(self, folder: Path, plans: dict[str, TrialPlan]) -> None:
         """Trials after a reset, of asynchronous pixels."""

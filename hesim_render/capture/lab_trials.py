@@ -78,10 +78,10 @@ def plan_trials(noise: EvsNoise, trials: int, parts: int = 0) -> dict[str, Trial
     parts : number of parts of 8 trials in the brightest steady light that are counted separately; 0 for none.
     """
     spec = noise.spec
-    assert spec.photoreceptor_cutoff_hz is not None
+    assert spec.noise_cutoff_hz is not None
     first = spec.coefficients[0]
     dn = first.beta2 / max(first.beta1, 1e-12)
-    period_us = US_PER_S / spec.photoreceptor_cutoff_hz
+    period_us = US_PER_S / spec.noise_cutoff_hz
     settle_us = max(math.ceil(_SETTLE * period_us), 2)
 
     def edges(ends: tuple[float, ...]) -> NDArray[np.int64]:

@@ -65,8 +65,8 @@ def noise_seconds(sensor: Sensor, duration_us: int, windows: float, *, rests: bo
     pixels = sensor.layout.evs_pixel.size
     steps = max(windows, duration_us / evs.tick_us if evs.tick_us is not None else 0.0)
     is_asynchronous = evs.reference == "last_event"
-    if is_asynchronous and evs.photoreceptor_cutoff_hz is not None:
-        steps += NODES_PER_CUTOFF_PERIOD * evs.photoreceptor_cutoff_hz * duration_us * S_PER_US
+    if is_asynchronous and evs.noise_cutoff_hz is not None:
+        steps += NODES_PER_CUTOFF_PERIOD * evs.noise_cutoff_hz * duration_us * S_PER_US
     # a tick behind a photoreceptor is one step as any other
     if is_asynchronous and evs.photoreceptor is not None and not rests:
         return steps * (_BENT_STEP_S + _BENT_STEP_PIXEL_S * pixels)

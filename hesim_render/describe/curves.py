@@ -90,9 +90,9 @@ class _Pixel:
             chances = [formulas.leak_probability(hz, tick_s) for hz in self.noise.comparator_noise_hz]
             free = (1 - on - off) * (1 - leak)
             return (on + (1 - on - off) * leak + free * chances[0]) / tick_s, (off + free * chances[1]) / tick_s
-        assert self.spec.photoreceptor_cutoff_hz is not None
+        assert self.spec.noise_cutoff_hz is not None
         dead_s = (self.noise.refractory_period_us or 0) * S_PER_US
-        bandwidth_hz = share * self.spec.photoreceptor_cutoff_hz
+        bandwidth_hz = share * self.spec.noise_cutoff_hz
         own = self.noise.comparator_noise_hz
         resets_hz = leak_hz + sum(own)
         on, off = noise_rates_hz(self.thresholds, self.mismatch, math.sqrt(variance), bandwidth_hz, dead_s, resets_hz)
@@ -103,20 +103,22 @@ class _Pixel:
         flux = np.maximum(lux * self.flux, 1e-30)
         if self.spec.reference == "previous_sample":
             return np.sqrt(1 / (flux * self.spec.window_us * S_PER_US))
-        assert self.spec.photoreceptor_cutoff_hz is not None
-        pole_hz = self.level(lux)[2] * self.spec.photoreceptor_cutoff_hz * POLE_HZ
+        assert self.spec.noise_cutoff_hz is not None
+        pole_hz = self.level(lux)[2] * self.spec.noise_cutoff_hz * POLE_HZ
         return np.sqrt(math.pi / 2 * pole_hz / flux)
 
     def latency(self, lux: float, step: float) -> float:
         """µs from a step up to the event."""
         before, after = (float(self.level(value)[0]) for value in (lux, lux * (1 + step)))
         spec, theta = self.noise.photoreceptor, self.thresholds[0]
+        # a step below the threshold gives no event
         if after - before <= theta:
             return math.nan
         # at a fixed tick the step falls anywhere in it
         sampling = 0.5 * self.spec.tick_us if self.spec.reference == "previous_sample" and self.spec.tick_us else 0.0
         if spec is None:
             return sampling
+        # the pixel settles with the corner that it has in the light after the step
         corner = spec.cutoff_hz
         if spec.follows_light:
             electrons = np.asarray(lux * (1 + step) * self.flux * (self.spec.window_us * S_PER_US))

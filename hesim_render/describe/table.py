@@ -94,11 +94,11 @@ def _events(sensor: Sensor) -> list[Row]:
     ]  # fmt: skip
     if evs.tick_us is not None:
         rows.append(Row("tick", evs.tick_us, "µs"))
-    if evs.photoreceptor_cutoff_hz is not None:
+    if evs.noise_cutoff_hz is not None:
         rows.append(
             Row(
                 "noise bandwidth",
-                evs.photoreceptor_cutoff_hz,
+                evs.noise_cutoff_hz,
                 "Hz",
                 None if sheet is None else sheet.noise_cutoff_hz,
             )

@@ -1,9 +1,4 @@
-"""The formats by name, and the opening of event files.
-
-RAW frames as files of other programs: 16-bit TIFF and PNG, NPY, and the ``.bin`` of the MIPI challenge.
-
-All hold the exact DN. The challenge's files are uint16, little endian: width, height, then the pixels row by row.
-"""
+"""The formats by name, and the opening of event files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,6 +18,7 @@ from hesim_render.exchange import (
     event_packets,
     evt2,
     evt3,
+    frame_files,
     mcap_file,
     nmnist,
     prophesee_hdf5,
@@ -31,39 +27,6 @@ from hesim_render.exchange import (
     text_form,
 )
 from hesim_render.exchange.stream import EventStream
-
-
-def write_tiff(path: Path, raw: NDArray[np.uint16]) -> None:
-    """Write a frame [row, col] as an uncompressed grey TIFF file of one strip."""
-    import tifffile
-
-    tifffile.imwrite(path, raw, photometric="minisblack", rowsperstrip=raw.shape[0], metadata=None, software=False)
-
-
-def write_png(path: Path, raw: NDArray[np.uint16]) -> None:
-    """Write a frame [row, col] as a grey 16-bit PNG file."""
-    from PIL import Image
-
-    Image.fromarray(raw).save(path, format="PNG", compress_level=1)
-
-
-def write_npy(path: Path, raw: NDArray[np.uint16]) -> None:
-    """Write a frame [row, col] as a NumPy file."""
-    np.save(path, raw)
-
-
-def write_mipi(path: Path, raw: NDArray[np.uint16]) -> None:
-    """Write a frame [row, col] as a file of the MIPI challenge.
-
-    Raises
-    ------
-    SpecError
-        If the frame has more than 65535 rows or columns.
-    """
-    rows, cols = raw.shape
-    if max(rows, cols) >= 1 << 16:
-        raise SpecError(f"the format holds at most 65535 rows and columns, not {cols}x{rows} px", file=path)
-    path.write_bytes(np.array([cols, rows], dtype="<u2").tobytes() + raw.astype("<u2").tobytes())
 
 
 @dataclass(frozen=True)
@@ -103,10 +66,10 @@ EVENT_FORMATS = {
     "nmnist": EventFormat(".bin", nmnist.write),
 }
 FRAME_FORMATS = {
-    "tiff": FrameFormat(".tiff", write_tiff),
-    "png": FrameFormat(".png", write_png),
-    "npy": FrameFormat(".npy", write_npy),
-    "mipi": FrameFormat(".bin", write_mipi),
+    "tiff": FrameFormat(".tiff", frame_files.write_tiff),
+    "png": FrameFormat(".png", frame_files.write_png),
+    "npy": FrameFormat(".npy", frame_files.write_npy),
+    "mipi": FrameFormat(".bin", frame_files.write_mipi),
 }
 #: Formats that can be read, by the first bytes of their files.
 _BEGINS = {b"% ": "raw", b"#!AER-DAT": "aedat4", b"\x89HDF\r\n\x1a\n": "dsec", b"PK": "npz", mcap_file.BEGIN: "mcap"}

@@ -18,6 +18,7 @@ from hesim_render.specs.files import Model, content_hash, validate
 from hesim_render.specs.lens import LENS_TERMS
 from hesim_render.specs.light import mixed_light
 from hesim_render.specs.reflectance import TextureSpec, leaves_of
+from hesim_render.specs.scene import SceneSpec
 from hesim_render.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ MASKS = {
 def build(
     sensor: "Sensor",
     *,
-    scene: BaseModel | None,
+    scene: SceneSpec | None,
     seed: int,
     duration_us: int,
     settings: Mapping[str, Any],
@@ -58,10 +59,9 @@ def build(
 ) -> dict[str, Any]:
     """The manifest of a new recording; frames and counts are added as it grows."""
     layout, spec = sensor.layout, sensor.spec
-    light = mixed_light(getattr(scene, "lights", ()))
-    lamps = getattr(scene, "lamps", ())
-    if light is None and lamps:
-        light = lamps[0].illuminant.load()
+    light = None if scene is None else mixed_light(scene.lights)
+    if light is None and scene is not None and scene.lamps:
+        light = scene.lamps[0].illuminant.load()
     described = mosaic.describe(sensor, light)
     if not settings.get("clean"):
         profile = noise_profile(sensor, settings.get("without", ()))
@@ -86,7 +86,7 @@ def build(
         "scene": None
         if scene is None
         else {
-            "name": getattr(scene, "name", ""),
+            "name": scene.name,
             "sha256": content_hash(scene),
             "files_sha256": _file_hashes(scene),
             "spec": _dump(scene),
@@ -102,22 +102,20 @@ def _dump(spec: BaseModel) -> dict[str, Any]:
     return spec.model_dump(mode="json", exclude_none=True)
 
 
-def _file_hashes(scene: BaseModel) -> dict[str, str]:
+def _file_hashes(scene: SceneSpec) -> dict[str, str]:
     """SHA-256 of each file of geometry, pictures and patches that a scene names (a Mitsuba XML file's own includes are
     not followed).
     """
-    folder = getattr(scene, "folder", Path())
-    mitsuba = getattr(scene, "mitsuba", None)
-    target, objects = getattr(scene, "target", None), getattr(scene, "objects", [])
-    names = [mitsuba.file if mitsuba is not None else None, *(item.mesh for item in objects)]
-    names += [getattr(target, key, None) for key in ("file", "patches")]
-    names += [getattr(light, "file", None) for light in getattr(scene, "lights", ())]
-    for item in objects:
+    names = [None if scene.mitsuba is None else scene.mitsuba.file, *(item.mesh for item in scene.objects)]
+    # targets of two kinds are made from files
+    names += [getattr(scene.target, key, None) for key in ("file", "patches")]
+    names += [light.file for light in scene.lights]
+    for item in scene.objects:
         names += [item.texture.file if item.texture is not None else None]
         names += item.deformation.files if item.deformation is not None else []
         names += [texture.file for _, texture in leaves_of(item.material or {}, TextureSpec)]
         names += [name for key, name in leaves_of(item.material or {}, str) if key.split(".")[-1] == "filename"]
-    return {name: WholeFile(folder / name).sha256() for name in names if name is not None}
+    return {name: WholeFile(scene.folder / name).sha256() for name in names if name is not None}
 
 
 def software_versions() -> dict[str, str]:

@@ -53,7 +53,7 @@ class RecordingWriter:
         path: str | Path | None,
         sensor: "Sensor",
         *,
-        scene: Any = None,
+        scene: SceneSpec | None = None,
         seed: int,
         duration_us: int,
         settings: Mapping[str, Any] | None = None,
@@ -182,7 +182,7 @@ class RecordingWriter:
         from hesim_render.sources.scene import Scene
 
         self._end_live(is_whole=True)
-        scene = Scene(self._scene) if isinstance(self._scene, SceneSpec) else None
+        scene = None if self._scene is None else Scene(self._scene)
         if self._folder is not None:
             recording = Recording.load(self._folder.finish())
             return Recording(recording.frames, recording.manifest, path=recording.path, scene=scene)

@@ -157,7 +157,7 @@ class Instrument:
         evs = self._noise.spec
         if evs.reference == "previous_sample":
             return 4 * (evs.tick_us or 1)
-        corner_hz = evs.photoreceptor_cutoff_hz or 1.0
+        corner_hz = evs.noise_cutoff_hz or 1.0
         if evs.photoreceptor is not None:
             corner_hz = evs.photoreceptor.cutoff_hz
             if evs.photoreceptor.follows_light:
@@ -191,7 +191,7 @@ class Instrument:
         evs = self._noise.spec
         if evs.reference == "previous_sample":
             return US_PER_S / (evs.tick_us or 1) / 4
-        return evs.photoreceptor.cutoff_hz if evs.photoreceptor else (evs.photoreceptor_cutoff_hz or 1.0)
+        return evs.photoreceptor.cutoff_hz if evs.photoreceptor else (evs.noise_cutoff_hz or 1.0)
 
     def _sine(self, hz: float, swing: float, cycles: int) -> tuple[NDArray[np.void], int]:
         """Events of light whose logarithm swings by `swing`, and the end, µs."""

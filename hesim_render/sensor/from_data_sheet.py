@@ -222,7 +222,7 @@ def _values(spec: SheetSensorSpec) -> dict[str, Any]:
         "coefficients": [beta],
         "shot_law": figures.shot_law,
         "leak_rate_hz": figures.leak_hz,
-        "photoreceptor_cutoff_hz": bandwidth_hz,
+        "noise_cutoff_hz": bandwidth_hz,
         "photoreceptor": photoreceptor or None,
         "refractory_period_us": figures.dead_us,
     }

@@ -116,7 +116,7 @@ def relative_illumination_at(
     )
     squared = x**2 + y**2
     if isinstance(kind, IlluminationTable):
-        return np.interp(np.sqrt(squared), kind.image_height_mm, kind.relative).astype(np.float32)
+        return np.interp(np.sqrt(squared), kind.image_height_mm, kind.illumination_rel).astype(np.float32)
     if kind == "none":
         return np.ones(squared.shape, dtype=np.float32)
     # not `** -2`, which takes ten times as long

@@ -105,6 +105,7 @@ class CrosstalkFlux:
         types = jit()
         result = []
         for half in halves:
+            # (1 − c) of its own electrons, and a quarter of c from each neighbour
             centre, *around = (dr.gather(types.Float, half, where) for where in index)
             result.append(
                 (1.0 - self._part) * centre + self._part / 4 * (around[0] + around[1] + around[2] + around[3])

@@ -20,7 +20,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Halves
 from hesim_render.mosaic.schedule import CELL_US, Block, blocks_of_run
-from hesim_render.sources.protocol import AuditableFlux, FluxSource, Sample
+from hesim_render.sources.protocol import AuditableFlux, FluxSource, Sample, WeightedFlux
 from hesim_render.sources.still import Kept
 from hesim_render.spectral.waveform import Waveform
 
@@ -34,8 +34,8 @@ class FlickerFlux:
     Parameters
     ----------
     waveforms : waveform of each source; None is steady.
-    sources : sources with the same geometry and camera. One whose attribute `light` is its waveform weights its means
-        over intervals with that waveform itself.
+    sources : sources with the same geometry and camera. A `WeightedFlux` of its waveform weights its means over
+        intervals itself.
     window_us : length of the window in which event pixels integrate, µs.
 
     Attributes
@@ -52,7 +52,7 @@ class FlickerFlux:
         self.is_static = False
         self._still = Kept(self.sources) if first.is_static else None
         self._is_whole = all(
-            waveform is None or getattr(source, "light", None) is waveform
+            waveform is None or (isinstance(source, WeightedFlux) and source.light is waveform)
             for waveform, source in zip(self._waveforms, self.sources, strict=True)
         )
 
@@ -114,6 +114,7 @@ class FlickerFlux:
             # computed for whole cells, so that the result does not depend on the interval
             bright = self._follow_us(low, high)
             motion = self.sources[0].sample_times_us(low, high) if bright.size else bright
+            # between cuts of either kind one of both hardly changes: the product of means holds. The fewer are taken
             cuts += [min(bright, motion, key=len), np.array([high], np.float64)]
         every = np.unique(np.concatenate(cuts))
         return every[(every > begin_us) & (every < end_us)]
@@ -124,12 +125,12 @@ class FlickerFlux:
         """Sum of each source's mean times the mean of its waveform. Sources without power in the interval are not
         asked.
         """
-        lit = [number for number, weight in enumerate(weights) if np.any(weight)]
-        halves = [self.sources[number].mean_flux(pixel, begin, end) for number in lit]
-        if not lit:
+        powered = [number for number, weight in enumerate(weights) if np.any(weight)]
+        halves = [self.sources[number].mean_flux(pixel, begin, end) for number in powered]
+        if not powered:
             types = jit()
             return types.Float(np.zeros(pixel.size, np.float32)), types.Float(np.zeros(pixel.size, np.float32))
-        return _weighted(halves, [weights[number] for number in lit])
+        return _weighted(halves, [weights[number] for number in powered])
 
     def _pieces(self, pixel: NDArray[np.uint32], begin: NDArray, end: NDArray, bounds: NDArray[np.float64]) -> Halves:
         """As `_piece`, piece by piece. A pixel takes part in the pieces that overlap its interval."""
@@ -179,6 +180,7 @@ class FlickerFlux:
                 for weights in np.stack(self._weights(begin, end), axis=1):
                     yield Sample(*_weighted(halves, list(weights)), np.zeros(pixels.size, np.float32))
             return
+        # each source is asked for the pieces of all windows in one stream; the sums take them up in the same order
         mine, *others = itertools.tee(map(self._cut, blocks), 1 + len(self.sources))
         streams = []
         for source, cut in zip(self.sources, others, strict=True):
@@ -188,6 +190,7 @@ class FlickerFlux:
             begin, end = pieces.begin_us[pieces.wanted], pieces.end_us[pieces.wanted]
             weights = np.stack(self._weights(begin, end), axis=1)
             for first, count in zip(np.cumsum(counts) - counts, counts, strict=True):
+                # weight of a piece: mean power in it, times its share of the window
                 length = end[first + count - 1] - begin[first]
                 share = (end - begin)[first : first + count] / length if length > 0 else np.ones(1)
                 yield self._sum([next(samples) for _ in range(count)], weights[first : first + count] * share[:, None])
@@ -260,9 +263,9 @@ class FlickerFlux:
         assert self._is_whole
         total = np.zeros((2, pixel.size))
         for source, weight in zip(self._auditable, self._weights(begin_us, end_us), strict=True):
-            lit = np.flatnonzero(weight)
-            result = source.reference_flux(pixel[lit], begin_us[lit], end_us[lit], quality, events)
-            total[:, lit] += weight[lit] * result
+            powered = np.flatnonzero(weight)
+            result = source.reference_flux(pixel[powered], begin_us[powered], end_us[powered], quality, events)
+            total[:, powered] += weight[powered] * result
         return total
 
 

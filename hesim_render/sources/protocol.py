@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.device_types import Float, Halves
 from hesim_render.mosaic.schedule import Block
+from hesim_render.spectral.waveform import Waveform
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,13 @@ class FluxSource(Protocol):
         ------
         One `Sample` per wanted window.
         """
+
+
+@runtime_checkable
+class WeightedFlux(Protocol):
+    """A source that weights its means over intervals with the waveform of its light itself; None: of steady light."""
+
+    light: Waveform | None
 
 
 @runtime_checkable

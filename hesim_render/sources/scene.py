@@ -216,12 +216,12 @@ def light_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
         return [(None, scene)]
     parts: list[tuple[Waveform | None, Scene]] = []
     for kind in _different(flickering):
-        lit = [
-            light.model_copy(update={"waveform": None}) if has == kind else light.unlit()
+        lights = [
+            light.model_copy(update={"waveform": None}) if has == kind else light.switched_off()
             for light, has in zip(shining, flickering, strict=True)
         ]
-        if any(light.is_lit for light in lit):
-            parts.append((kind.load() if kind else None, _with_lights(scene, lit)))
+        if any(light.is_on for light in lights):
+            parts.append((kind.load() if kind else None, _with_lights(scene, lights)))
     return parts or [(None, scene)]
 
 
@@ -239,9 +239,9 @@ def _different(kinds: Sequence[WaveformSpec | None]) -> list[WaveformSpec | None
     return result
 
 
-def _with_lights(scene: Scene, lit: Sequence[Any]) -> Scene:
+def _with_lights(scene: Scene, lights: Sequence[Any]) -> Scene:
     """The scene with other lights: its own, then the target if that shines, then its objects that shine."""
-    left = iter(lit)
+    left = iter(lights)
     update: dict[str, Any] = {"light": tuple(next(left) for _ in scene.spec.lights)}
     if lamps_of(scene.spec.target) is not None:
         update["target"] = next(left)

@@ -71,6 +71,7 @@ class WindowByWindow(ABC):
         """See `FluxSource.flux_of_blocks`; a window may straddle several slices."""
         for block in blocks:
             for begin, end in zip(block.begin_us[block.wanted], block.end_us[block.wanted], strict=True):
+                # the mean over the window: slices weighted by the time they have in it
                 bounds = [begin, *self.slice_edges_us(begin, end), end]
                 total_a: Float = 0.0
                 total_b: Float = 0.0
@@ -99,6 +100,7 @@ class Kept:
         types = jit()
         self._reach(int(pixel.max()) + 1 if pixel.size else 0)
         if not self._known[pixel].all():
+            # a static source shows the same at all times, so any interval will do
             fresh = distinct_pixels(pixel[~self._known[pixel]])
             where = types.UInt32(fresh)
             for source, kept in zip(self._sources, self._kept, strict=True):

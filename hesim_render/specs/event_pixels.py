@@ -67,7 +67,7 @@ class PhotoreceptorSpec(Strict):
         None, ge=1e-3, le=1e6, description="corner in the dark; up to signal_dn it rises on a straight line"
     )
     filters_noise: bool = Field(
-        False, description="the noise (last_event) passes it too: below photoreceptor_cutoff_hz its bandwidth is the "
+        False, description="the noise (last_event) passes it too: below noise_cutoff_hz its bandwidth is the "
         "corner, and its variance falls with it"
     )  # fmt: skip
     approach: Literal["abrupt", "gradual"] = Field(
@@ -85,7 +85,7 @@ class PhotoreceptorSpec(Strict):
         elif self.signal_dn is not None or self.min_cutoff_hz is not None:
             raise ValueError("without follows_light the corner is cutoff_hz: leave signal_dn and min_cutoff_hz out")
         elif self.filters_noise:
-            raise ValueError("filters_noise needs follows_light; otherwise photoreceptor_cutoff_hz says the same")
+            raise ValueError("filters_noise needs follows_light; otherwise noise_cutoff_hz says the same")
         elif self.approach == "gradual":
             raise ValueError("approach 'gradual' needs follows_light; a corner that is the same in any light has none")
         return self
@@ -136,7 +136,7 @@ class LeakSpec(Strict):
 
 
 class NoiseSpreadSpec(Strict):
-    """Bandwidth of the noise (last_event) that differs from pixel to pixel, about photoreceptor_cutoff_hz."""
+    """Bandwidth of the noise (last_event) that differs from pixel to pixel, about noise_cutoff_hz."""
 
     bandwidth_rel: float = Field(0.0, ge=0, le=1, description="std over pixels of its natural logarithm")
     odd_rows_rel: float = Field(
@@ -149,7 +149,7 @@ class NoiseSpreadSpec(Strict):
 
     @property
     def most(self) -> float:
-        """Largest bandwidth of a pixel over photoreceptor_cutoff_hz: three deviations above the others of its kind."""
+        """Largest bandwidth of a pixel over noise_cutoff_hz: three deviations above the others of its kind."""
         return (1 + abs(self.odd_rows_rel)) * (1 + abs(self.odd_cols_rel)) * math.exp(3 * self.bandwidth_rel)
 
 
@@ -240,7 +240,9 @@ class EvsSpec(SheetEvsSpec):
     coefficients: list[EvsCoefficients] = Field(min_length=1, description="one for all, or one per event position")
     shot_law: Literal["linear", "sqrt"]
     leak_rate_hz: float = Field(0.0, ge=0, le=1e6, description="Poisson process of ON events, per pixel")
-    photoreceptor_cutoff_hz: float | None = Field(None, ge=1e-3, le=1e6, description="noise bandwidth (last_event)")
+    noise_cutoff_hz: float | None = Field(
+        None, ge=1e-3, le=1e6, description="-3 dB frequency of the noise (last_event)"
+    )
     photoreceptor: PhotoreceptorSpec | None = Field(None, description="bandwidth of the signal; default unlimited")
     refractory_period_us: int | None = Field(
         None, ge=1, le=10**9, description="no event so long after a pixel's last one"
@@ -253,8 +255,8 @@ class EvsSpec(SheetEvsSpec):
                 raise ValueError("reference 'previous_sample' needs tick_us")
             if self.window_us > self.tick_us:
                 raise ValueError(f"window_us {self.window_us} is longer than tick_us {self.tick_us}")
-        elif self.photoreceptor_cutoff_hz is None:
-            raise ValueError("reference 'last_event' needs photoreceptor_cutoff_hz, the bandwidth of its noise")
+        elif self.noise_cutoff_hz is None:
+            raise ValueError("reference 'last_event' needs noise_cutoff_hz, the bandwidth of its noise")
         for key in ("contrast_threshold_on", "contrast_threshold_off"):
             # a change of several thresholds gives as many events in this mode
             if self.reference == "last_event" and getattr(self, key) < _LEAST_THRESHOLD:
@@ -266,8 +268,8 @@ class EvsSpec(SheetEvsSpec):
                 raise ValueError("photoreceptor.filters_noise belongs to reference 'last_event'")
             if self.noise_spread is not None:
                 raise ValueError("noise_spread and photoreceptor.filters_noise both set bandwidths: leave one out")
-            if (self.photoreceptor_cutoff_hz or 0.0) > self.photoreceptor.cutoff_hz:
-                raise ValueError("photoreceptor_cutoff_hz is above photoreceptor.cutoff_hz, which filters the noise")
+            if (self.noise_cutoff_hz or 0.0) > self.photoreceptor.cutoff_hz:
+                raise ValueError("noise_cutoff_hz is above photoreceptor.cutoff_hz, which filters the noise")
         if self.leak is not None and self.leak_rate_hz > 0:
             raise ValueError("leak and leak_rate_hz (or leak_hz of a data sheet) say the same: leave one of them out")
         if self.readout_buffer_events is not None and self.readout_max_events_per_s is None:

@@ -31,12 +31,12 @@ class IlluminationTable(Strict):
     """Relative illumination against image height, linear between points, constant beyond the last."""
 
     image_height_mm: list[float] = Field(min_length=2)
-    relative: list[float] = Field(min_length=2)
+    illumination_rel: list[float] = Field(min_length=2)
 
     @model_validator(mode="after")
     def _check(self) -> "IlluminationTable":
-        _rising("image_height_mm", self.image_height_mm, "relative", self.relative)
-        if any(not 0 <= value <= 1 for value in self.relative):
+        _rising("image_height_mm", self.image_height_mm, "illumination_rel", self.illumination_rel)
+        if any(not 0 <= value <= 1 for value in self.illumination_rel):
             raise ValueError("relative illumination must lie in [0, 1]")
         return self
 
@@ -156,16 +156,16 @@ class MeasuredPsf(Strict):
 
 
 class LateralChromatic(Strict):
-    """Lateral chromatic aberration: the image at a wavelength is larger than the nominal one by a factor 1 + relative.
-    Linear between the wavelengths, constant beyond them.
+    """Lateral chromatic aberration: the image at a wavelength has 1 + magnification_rel times its
+    nominal size. Linear between the wavelengths, constant beyond them.
     """
 
     wavelength_nm: list[float] = Field(min_length=2)
-    relative: list[Annotated[float, Field(ge=-0.1, le=0.1)]] = Field(min_length=2)
+    magnification_rel: list[Annotated[float, Field(ge=-0.1, le=0.1)]] = Field(min_length=2)
 
     @model_validator(mode="after")
     def _check(self) -> "LateralChromatic":
-        _rising("wavelength_nm", self.wavelength_nm, "relative", self.relative)
+        _rising("wavelength_nm", self.wavelength_nm, "magnification_rel", self.magnification_rel)
         return self
 
 

@@ -124,11 +124,11 @@ class LightSpec(InFolder):
         return self
 
     @property
-    def is_lit(self) -> bool:
+    def is_on(self) -> bool:
         """False in darkness: type 'none', or a level of zero."""
         return self.type != "none" and bool(self.illuminance_lux or self.irradiance_w_m2)
 
-    def unlit(self) -> "LightSpec":
+    def switched_off(self) -> "LightSpec":
         """The same light switched off; its geometry stays."""
         off = {"waveform": None, "illuminance_lux": 0.0, "irradiance_w_m2": None}
         return self if self.type == "none" else self.model_copy(update=off)
@@ -142,11 +142,11 @@ class LampSpec(Strict):
     waveform: WaveformSpec | None = Field(None, description="flicker; default steady")
 
     @property
-    def is_lit(self) -> bool:
+    def is_on(self) -> bool:
         """False where the luminance is zero."""
         return self.luminance_cd_m2 > 0
 
-    def unlit(self) -> "LampSpec":
+    def switched_off(self) -> "LampSpec":
         """The same target switched off; its geometry stays."""
         return self.model_copy(update={"waveform": None, "luminance_cd_m2": 0.0})
 
@@ -157,7 +157,7 @@ class LampSpec(Strict):
 
 def irradiance(light: LightSpec) -> Spectrum | None:
     """E(λ) on the light's plane, W m⁻² nm⁻¹, time mean; None in darkness."""
-    if not light.is_lit:
+    if not light.is_on:
         return None
     shape = light.illuminant.load()
     if light.illuminance_lux is not None:

@@ -122,7 +122,7 @@ def integrate_product(*spectra: Spectrum) -> float:
     return float(np.sum(weight @ values * half))
 
 
-def product(*spectra: Spectrum, step_nm: float = INTEGRATION_STEP_NM) -> Spectrum:
+def product(*spectra: Spectrum) -> Spectrum:
     """The product sampled on `merged_grid`, over the common support.
 
     Raises
@@ -130,7 +130,7 @@ def product(*spectra: Spectrum, step_nm: float = INTEGRATION_STEP_NM) -> Spectru
     SpecError
         If the supports do not overlap.
     """
-    grid = merged_grid(*spectra, step_nm=step_nm)
+    grid = merged_grid(*spectra)
     if grid.size == 0:
         supports = ", ".join("{:g}-{:g} nm".format(*s.support_nm) for s in spectra)
         raise SpecError(f"spectra do not overlap in wavelength ({supports})")

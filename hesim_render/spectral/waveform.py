@@ -141,6 +141,7 @@ class Pwm:
         span = self.frequency_hz / US_PER_S * (end - begin)
         start, span = np.broadcast_arrays(start, span)
         now = np.where(start < self.duty, 1 / self.duty, 0.0)
+        # time that it is on in the interval; of an instant, the power then
         total = (self._on(start + span) - self._on(start)) / self.duty
         return np.divide(total, span, out=now, where=span > 0)
 
@@ -196,6 +197,7 @@ class TableWaveform:
         """∫ w from the first sample on, µs; `local_us` is relative to that sample and may lie outside the table."""
         times, power = self._times, self._power
         place = np.clip(np.searchsorted(times, local_us, side="right") - 1, 0, times.size - 2)
+        # inside the table the integral of straight lines, outside that of the held end
         held = np.clip(local_us, 0.0, times[-1])
         since = held - times[place]
         slope = (power[place + 1] - power[place]) / (times[place + 1] - times[place])
@@ -210,6 +212,7 @@ class TableWaveform:
         start, whole = begin - self.t_us[0], np.zeros(begin.shape)
         if self.repeat:
             start = np.mod(start, period_us)
+            # whole periods have the integral of the table, the rest is looked up
             whole = np.floor((start + span) / period_us)
         now = np.array(np.interp(start, self._times, self._power))
         total = whole * self._before[-1] + self._integral(start + span - whole * period_us) - self._integral(start)

@@ -176,7 +176,7 @@ def disc_grid(target: CircleGridTarget | LedGridTarget) -> list[TargetPiece]:
     board = [*(polygon + centre for centre in centres for polygon in ring), *rest]
     discs = [rim + centre for centre in centres]
     if isinstance(target, LedGridTarget):
-        radiance = target.radiance() if target.is_lit else None
+        radiance = target.radiance() if target.is_on else None
         lamps = polygons_piece("lamps", target.dark.load(), discs, radiance)
         return [polygons_piece("board", target.light.load(), board), lamps]
     return [

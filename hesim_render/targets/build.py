@@ -120,7 +120,7 @@ def integrating_sphere(target: IntegratingSphereTarget) -> list[TargetPiece]:
     port, half = disc(target.port_diameter_m / 2), target.plate_m / 2
     black = constant(0.0)
     return [
-        polygons_piece("port", black, [port], target.radiance() if target.is_lit else None),
+        polygons_piece("port", black, [port], target.radiance() if target.is_on else None),
         polygons_piece("plate", black, around(port, -half, half, -half, half)),
     ]
 

@@ -124,6 +124,7 @@ def patch_boxes(rows: int, cols: int, width_m: float, height_m: float, fill: flo
 def between_patches(boxes: NDArray[np.float64], cols: int, width_m: float, height_m: float) -> list[ArrayLike]:
     """Boxes of the lattice around patches from `patch_boxes`: nothing lies behind a patch."""
     w, h = width_m / 2, height_m / 2
+    # borders of patches and of the target cut it into a lattice, in which every second cell of both axes is a patch
     x = np.unique(np.concatenate([[-w], np.sort(boxes[:cols, :2].ravel()), [w]]))
     y = np.unique(np.concatenate([[-h], np.sort(boxes[::cols, 2:].ravel()), [h]]))
     return [
@@ -150,6 +151,7 @@ def around(hole: NDArray[np.float64], x0: float, x1: float, y0: float, y1: float
     x0, x1, y0, y1 : limits of the rectangle, which contains the hole.
     """
     rectangle = np.array(box(x0, x1, y0, y1))
+    # sectors between the directions of all corners: in each, hole and rectangle have one straight side
     outline = np.concatenate([hole, rectangle])
     angles = np.unique(np.round(np.arctan2(outline[:, 1], outline[:, 0]), 12))
     ends = np.append(angles, angles[0] + 2 * pi)
@@ -162,6 +164,7 @@ def _reach(polygon: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray
     following = np.roll(polygon, -1, axis=0)
     normal = np.column_stack([following[:, 1] - polygon[:, 1], polygon[:, 0] - following[:, 0]])
     direction = np.column_stack([np.cos(angles), np.sin(angles)])
+    # a ray leaves at the first of the lines that it comes nearer to
     away = np.sum(normal * polygon, axis=1)
     speed = direction @ normal.T
     length = np.min(np.where(speed > 0, away / np.where(speed > 0, speed, 1.0), np.inf), axis=1)
@@ -201,6 +204,7 @@ def bent(piece: TargetPiece, radius_m: float, step_m: float) -> TargetPiece:
     for triangle in corners:
         low, high = np.floor(triangle[:, 0].min() / step_m), np.ceil(triangle[:, 0].max() / step_m)
         for k in range(int(low), int(high)):
+            # the part of the triangle between two lines, as a fan of triangles
             part = clipped(triangle, triangle[:, 0] - k * step_m)
             part = clipped(part, (k + 1) * step_m - part[:, 0])
             parts += [part[[0, j, j + 1]] for j in range(1, len(part) - 1)]

@@ -145,7 +145,7 @@ def test_a_killed_worker_leaves_the_same_bytes(built, tmp_path):
 
     def kill():
         pid = await_builder(root)
-        assert pid in workers[0].pids
+        assert pid in {worker.process.pid for worker in workers[0]._workers}
         os.kill(pid, signal.SIGKILL)
         killed.append(pid)
 

@@ -260,7 +260,7 @@ def test_two_workers_with_spans_and_a_kill_in_one_leave_the_same_bytes(whole, tm
     def run(self, clips, told, spans):
         def kill():
             await_span(root, 1000)
-            killed.append(self.pids[-1])
+            killed.append(self._workers[-1].process.pid)
             os.kill(killed[0], signal.SIGKILL)
 
         threading.Thread(target=kill, daemon=True).start()

@@ -31,7 +31,7 @@ def scores(section, pixels):
         name: (section[name]["value"], section[name]["standard_error"], truth)
         for name, truth in (
             ("theta_on", pixels.theta_on), ("theta_off", pixels.theta_off), ("threshold_mismatch_rel", pixels.mismatch),
-            ("photoreceptor_cutoff_hz", pixels.cutoff_hz), ("leak_rate_hz", pixels.leak_hz),
+            ("noise_cutoff_hz", pixels.cutoff_hz), ("leak_rate_hz", pixels.leak_hz),
         )
     }  # fmt: skip
     beta, error = section["beta"][0], section["beta_standard_error"][0]
@@ -109,7 +109,7 @@ def test_every_parameter_is_recovered(plain):
     assert max(abs(z) for z in scores(section, TRUTH).values()) < 3.5
     assert section["shot_law"] == "sqrt" and section["shot_law_decisive"]
     assert section["threshold_mismatch_rel"]["standard_error"] < 0.02 * TRUTH.mismatch
-    assert section["photoreceptor_cutoff_hz"]["standard_error"] < 0.03 * TRUTH.cutoff_hz
+    assert section["noise_cutoff_hz"]["standard_error"] < 0.03 * TRUTH.cutoff_hz
     for item in section["noise"]:
         assert item["value"] == pytest.approx(TRUTH.sigma(item["signal_dn"]), rel=0.02)
 
@@ -591,7 +591,7 @@ def test_a_calibrated_sensor_behaves_like_the_captured_one(session, tmp_path):
     spec = again.spec.evs
     assert spec.contrast_threshold_on == pytest.approx(0.2, rel=0.03)
     assert spec.threshold_mismatch_rel == pytest.approx(0.15, rel=0.12)
-    assert spec.photoreceptor_cutoff_hz == pytest.approx(300, rel=0.06)
+    assert spec.noise_cutoff_hz == pytest.approx(300, rel=0.06)
     assert again.evs.threshold_on_map.std() == pytest.approx(sensor.evs.threshold_on_map.std(), rel=0.1)
     write_captures(
         again, tmp_path / "c", frames=8, trials=6, seed=8, dark_exposures_us=(1000, 5000), lit_exposures_us=(1000, 5000)

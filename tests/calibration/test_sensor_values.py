@@ -97,10 +97,10 @@ def test_values_of_asynchronous_pixels():
     evs = SimpleNamespace(
         beta=[[9.0, 1.5, 1.0, 0.3, 0.02, 0.4]], theta_on=item(0.21), theta_off=item(0.27),
         threshold_mismatch_rel=item(0.05), shot_law="linear", leak_rate_hz=item(-0.01),
-        photoreceptor_cutoff_hz=item(310.0),
+        noise_cutoff_hz=item(310.0),
     )  # fmt: skip
     assert _asynchronous_values({"evs": {"reference": "last_event"}}, evs, FILE) == {
         "contrast_threshold_on": 0.21, "contrast_threshold_off": 0.27, "threshold_mismatch_rel": 0.05,
         "coefficients": [{"beta1": 1.5, "beta2": 1.0, "beta3": 0.3, "beta4": 0.02, "beta5": 0.4}],
-        "shot_law": "linear", "leak_rate_hz": 0.0, "photoreceptor_cutoff_hz": 310.0,
+        "shot_law": "linear", "leak_rate_hz": 0.0, "noise_cutoff_hz": 310.0,
     }  # fmt: skip

@@ -218,7 +218,7 @@ def test_the_truth_knows_what_is_off_or_mixed():
     davis = hr.load_sensor("davis346", {"aps.row_noise_dn": 0.7}).crop(16, 8)
     found = truth_of(set_up(davis, LIT_EXPOSURES_US), 80_000)
     assert found["aps"]["row_noise_dn"] == 0.7 and not {"read_noise_e", "full_well_e"} & set(found["aps"])
-    assert found["evs"]["photoreceptor_cutoff_hz"] == davis.spec.evs.photoreceptor_cutoff_hz and "A" not in found["evs"]
+    assert found["evs"]["noise_cutoff_hz"] == davis.spec.evs.noise_cutoff_hz and "A" not in found["evs"]
 
 
 @pytest.mark.usefixtures("few_trials")
@@ -740,7 +740,7 @@ def test_steps_of_a_plan_reach_parts_of_both_thresholds():
     the light would end below a thousandth of itself the step is left out."""
     first = SimpleNamespace(beta1=0.04, beta2=0.9)
     spec = SimpleNamespace(
-        photoreceptor_cutoff_hz=170.0, coefficients=[first], contrast_threshold_on=0.21, contrast_threshold_off=0.34
+        noise_cutoff_hz=170.0, coefficients=[first], contrast_threshold_on=0.21, contrast_threshold_off=0.34
     )
     plans = lab_trials.plan_trials(SimpleNamespace(spec=spec), 6)
     steps = plans["evs_s_curve"]

@@ -29,7 +29,7 @@ def told(name, rays=RAYS, size=(64, 48), **changes):
 def test_steps_go_to_windows_and_to_nodes_of_the_noise():
     """16 nodes in each period of the noise, in still light as well; steps behind a photoreceptor cost more."""
     sensor = hr.load_sensor("imx636").crop(64, 48)
-    steps = RUN["windows"] + 16 * sensor.spec.evs.photoreceptor_cutoff_hz * 0.05
+    steps = RUN["windows"] + 16 * sensor.spec.evs.noise_cutoff_hz * 0.05
     plain, bent = 0.4e-3 + 0.035e-6 * 64 * 48, 2.5e-3 + 0.035e-6 * 64 * 48
     more = told("imx636") - told("imx636", rests=True) - RUN["windows"] * overheads._WINDOW_S
     assert more == pytest.approx(steps * (bent - plain), rel=1e-9)

@@ -14,8 +14,8 @@ EFFECTS = {
     "depth_of_field": "true",
     "diffraction": "true",
     "psf": f"{{type: measured, sample_um: 2, kernels: {KERNEL}}}",
-    "lateral_chromatic": "{wavelength_nm: [400, 700], relative: [-0.001, 0.001]}",
-    "relative_illumination": "{image_height_mm: [0, 2], relative: [1.0, 0.6]}",
+    "lateral_chromatic": "{wavelength_nm: [400, 700], magnification_rel: [-0.001, 0.001]}",
+    "relative_illumination": "{image_height_mm: [0, 2], illumination_rel: [1.0, 0.6]}",
     "veiling_glare": "0.05",
 }
 NEEDS_EXACT = {"diffraction", "lateral_chromatic", "veiling_glare"}

@@ -66,7 +66,7 @@ def simulated_rates(sensor, lux, begin_s, seconds, seed=3):
 def of_drawn_thresholds(sensor, lux):
     """Background of the very pixels of this sensor, by the closed form for each pixel's thresholds."""
     evs, sheet = sensor.spec.evs, sensor.spec.evs.data_sheet
-    bandwidth_hz = evs.photoreceptor_cutoff_hz * float(sensor.evs.noise_share(electrons(sensor, lux).numpy()[:1], 0)[0])
+    bandwidth_hz = evs.noise_cutoff_hz * float(sensor.evs.noise_share(electrons(sensor, lux).numpy()[:1], 0)[0])
     sigma = event_curves(sensor, [float(lux)]).sigma[0]
     on, off = (np.ravel(each) / sigma for each in (sensor.evs.threshold_on_map, sensor.evs.threshold_off_map))
     events = events_per_period(on, off, evs.refractory_period_us * 1e-6 * bandwidth_hz, sheet.leak_hz / bandwidth_hz)
@@ -175,7 +175,7 @@ def test_rates_are_those_of_the_dead_time_and_of_the_leak(dead_us, monkeypatch):
 def test_rates_of_a_gradual_corner_and_comparator_noise(lux):
     """The closed form and a simulation, where light, bias and the comparators each have a part of the events."""
     changes = {
-        "evs.photoreceptor_cutoff_hz": 210.0, "evs.comparator_noise": {"on_hz": 0.6, "off_hz": 1.7},
+        "evs.noise_cutoff_hz": 210.0, "evs.comparator_noise": {"on_hz": 0.6, "off_hz": 1.7},
         "evs.photoreceptor": {
             "cutoff_hz": 340.0, "signal_dn": 900.0, "min_cutoff_hz": 4.0, "filters_noise": True, "approach": "gradual",
         },
@@ -361,7 +361,7 @@ def test_noise_and_latency_have_no_kink_where_the_dark_current_begins(name):
     dark_lux, evs, sensor = SHEETS[name].dark_lux, read_sensor(name).evs, hr.load_sensor(name)
     dim = event_curves(sensor, np.geomspace(dark_lux / 10, 5 * dark_lux, 102), step=7.0)
     (beta,) = evs.coefficients
-    share = evs.photoreceptor.min_cutoff_hz / evs.photoreceptor_cutoff_hz
+    share = evs.photoreceptor.min_cutoff_hz / evs.noise_cutoff_hz
     np.testing.assert_allclose(dim.sigma, beta.beta4 / dark_lux * np.sqrt(share), rtol=2e-4)
     # a step of the exponent by 1 has a second difference of 0.04
     for values in (dim.sigma, dim.on_hz + dim.off_hz, dim.latency_us):

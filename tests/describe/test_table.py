@@ -38,7 +38,7 @@ def test_geometry_and_frames_by_hand():
 def test_events_by_hand():
     changes = {
         "evs.contrast_threshold_on": 0.18, "evs.contrast_threshold_off": 0.31, "evs.threshold_mismatch_rel": 0.04,
-        "evs.leak_rate_hz": 0.7, "evs.photoreceptor_cutoff_hz": 900.0, "evs.refractory_period_us": 130.0,
+        "evs.leak_rate_hz": 0.7, "evs.noise_cutoff_hz": 900.0, "evs.refractory_period_us": 130.0,
         "evs.data_sheet": None, "evs.leak": None,
     }  # fmt: skip
     sensor = hr.load_sensor("davis346", changes)

@@ -9,7 +9,7 @@ import tifffile
 from PIL import Image
 
 from hesim_render.core.errors import SpecError
-from hesim_render.exchange.formats import write_mipi
+from hesim_render.exchange.frame_files import write_mipi
 from hesim_render.recording.recording import Recording
 
 

@@ -72,7 +72,7 @@ def noise_every(times, noise, seed, cutoff_hz):
 )
 def test_events_are_those_of_the_curve(follows, dead_us, noisy):
     """Every event against steps of 2 µs; between two nodes, 104 µs apart, y is taken as a straight line."""
-    light = {"evs__photoreceptor": FOLLOWING if follows else FIXED, "evs__photoreceptor_cutoff_hz": 130.0}
+    light = {"evs__photoreceptor": FOLLOWING if follows else FIXED, "evs__noise_cutoff_hz": 130.0}
     coefficients = {"evs__coefficients": NOISY["evs__coefficients"]} if noisy else {}
     noise = asynchronous(SIDE, evs__refractory_period_us=dead_us, **light, **coefficients)
     events = events_of(noise)

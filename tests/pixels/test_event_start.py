@@ -28,7 +28,7 @@ def pixels(**overrides):
     spec = read_sensor(
         "reference-mono",
         {"geometry.rows": SIDE, "geometry.cols": SIDE + 8, "evs.coefficients": [NOISY], "evs.reference": "last_event",
-         "evs.tick_us": None, "evs.photoreceptor_cutoff_hz": 250.0, "evs.contrast_threshold_on": 0.182,
+         "evs.tick_us": None, "evs.noise_cutoff_hz": 250.0, "evs.contrast_threshold_on": 0.182,
          "evs.contrast_threshold_off": 0.21, **changes},
     )  # fmt: skip
     return EvsNoise(spec.evs, Layout.full(spec), spec.device_seed, np.ones(1))
@@ -277,7 +277,7 @@ def test_shipped_sensors_have_their_background_from_the_first_moment(name):
     if variance == 0:
         return
     share = float(np.ravel(noise.noise_share(np.array([electrons]), 0))[0])
-    bandwidth_hz = share * spec.photoreceptor_cutoff_hz
+    bandwidth_hz = share * spec.noise_cutoff_hz
     own = [np.ravel(theta) / np.sqrt(variance) for theta in (noise.threshold_on_map, noise.threshold_off_map)]
     dead_s = (spec.refractory_period_us or 0) * 1e-6
     events = events_per_period(*own, dead_s * bandwidth_hz, spec.leak_rate_hz / bandwidth_hz).mean()

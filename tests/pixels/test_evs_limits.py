@@ -45,7 +45,7 @@ def model(side=16, **overrides):
 
 
 def asynchronous(side=16, **overrides):
-    defaults = {"evs__reference": "last_event", "evs__photoreceptor_cutoff_hz": 300.0}
+    defaults = {"evs__reference": "last_event", "evs__noise_cutoff_hz": 300.0}
     return model(side, **{**defaults, **overrides})
 
 

@@ -29,7 +29,7 @@ def model(side=512, crop=None, **overrides):
 def asynchronous(side=128, **overrides):
     """The same with the level of the last event kept; without light noise is s/x = β4/β2."""
     coefficients = [{"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 0.08, "beta5": 0.0}]
-    defaults = {"evs__reference": "last_event", "evs__photoreceptor_cutoff_hz": 300.0,
+    defaults = {"evs__reference": "last_event", "evs__noise_cutoff_hz": 300.0,
                 "evs__coefficients": coefficients, "evs__contrast_threshold_on": 0.2,
                 "evs__contrast_threshold_off": 0.23}  # fmt: skip
     return model(side, **{**defaults, **overrides})

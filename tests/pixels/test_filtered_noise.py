@@ -19,7 +19,7 @@ SHARES = np.array([0.02, 0.06975, 0.34835, 1.0])
 GRADUAL = np.array([2.0, 6.975, 34.835, 400.0]) / np.array([102.0, 106.975, 134.835, 500.0])
 APPROACHES = (("abrupt", SHARES), ("gradual", GRADUAL))
 FILTERED = {
-    "evs.photoreceptor_cutoff_hz": 100.0,
+    "evs.noise_cutoff_hz": 100.0,
     "evs.photoreceptor": {
         "cutoff_hz": 400.0, "signal_dn": 400.0, "min_cutoff_hz": 2.0, "filters_noise": True,
     },
@@ -143,7 +143,7 @@ def test_events_of_filtered_noise_do_not_depend_on_sampling_or_on_a_stop():
          "filters_noise needs follows_light"),
         ({"evs.photoreceptor": {"cutoff_hz": 400.0, "follows_light": False, "approach": "gradual"}},
          "'gradual' needs follows_light"),
-        ({"evs.photoreceptor_cutoff_hz": 500.0}, "above photoreceptor.cutoff_hz"),
+        ({"evs.noise_cutoff_hz": 500.0}, "above photoreceptor.cutoff_hz"),
         ({"evs.reference": "previous_sample", "evs.tick_us": 1000}, "belongs to reference 'last_event'"),
     ],
 )  # fmt: skip

@@ -21,7 +21,7 @@ SIZE = ROWS * COLS
 NOISY = {"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 5.0, "beta5": 0.0}
 #: Terms that make noise; bandwidth stays.
 NOISES = ("shot", "dark_current", "leak", "stuck", "hot", "flickering")
-ASYNCHRONOUS = {"evs.reference": "last_event", "evs.tick_us": None, "evs.photoreceptor_cutoff_hz": 300.0,
+ASYNCHRONOUS = {"evs.reference": "last_event", "evs.tick_us": None, "evs.noise_cutoff_hz": 300.0,
                 "evs.noise_mode": None}  # fmt: skip
 
 

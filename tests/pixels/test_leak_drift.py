@@ -31,7 +31,7 @@ def pixels(leak, sigma=0.0, **overrides):
     spec = read_sensor(
         "reference-mono",
         {"geometry.rows": SHAPE[0], "geometry.cols": SHAPE[1], "evs.coefficients": [beta],
-         "evs.reference": "last_event", "evs.photoreceptor_cutoff_hz": CUTOFF_HZ, "evs.threshold_mismatch_rel": 0.0,
+         "evs.reference": "last_event", "evs.noise_cutoff_hz": CUTOFF_HZ, "evs.threshold_mismatch_rel": 0.0,
          "evs.contrast_threshold_on": THETA_ON, "evs.contrast_threshold_off": THETA_OFF, "evs.leak": leak, **changes},
     )  # fmt: skip
     return EvsNoise(spec.evs, Layout.full(spec), spec.device_seed, np.full(1, 1.3))
@@ -273,7 +273,7 @@ def test_the_mean_rate_is_that_of_its_law():
 ), ids=("tick", "poisson-spread", "twice"))  # fmt: skip
 def test_keys_that_do_not_go_together(changes, told):
     with pytest.raises(SpecError, match=told):
-        read_sensor("reference-mono", {"evs.photoreceptor_cutoff_hz": 90.0, "evs.reference": "last_event", **changes})
+        read_sensor("reference-mono", {"evs.noise_cutoff_hz": 90.0, "evs.reference": "last_event", **changes})
 
 
 def test_the_mean_leak_of_a_pixel_grows_with_its_signal():

@@ -24,7 +24,7 @@ def spec_of(**changes):
         "evs.tick_us": None, "evs.window_us": 1000, "evs.contrast_threshold_on": 0.23,
         "evs.contrast_threshold_off": 0.27, "evs.threshold_mismatch_rel": 0.0,
         "evs.signal_reference": {"k_dn_per_e": 1.0, "t_ref_us": 1000.0, "filter": "own"}, "evs.coefficients": [beta],
-        "evs.shot_law": "sqrt", "evs.photoreceptor_cutoff_hz": 37.0, "evs.leak_rate_hz": 0.0,
+        "evs.shot_law": "sqrt", "evs.noise_cutoff_hz": 37.0, "evs.leak_rate_hz": 0.0,
         "evs.refractory_period_us": None, "evs.photoreceptor": None, "evs.noise_spread": SPREAD, **changes,
     })  # fmt: skip
 

@@ -152,7 +152,7 @@ def test_hot_and_flickering_pixels_fire_as_their_closed_forms(reference):
     At a tick there is an event with 1 − e^(−rΔt); counts of hot pixels are binomial or Poisson.
     """
     ticks = 1000
-    extra = {} if reference == "previous_sample" else {"evs__photoreceptor_cutoff_hz": 300.0}
+    extra = {} if reference == "previous_sample" else {"evs__noise_cutoff_hz": 300.0}
     noise = sensor(evs__defects=DEFECTS, evs__reference=reference, **extra).evs
     found = noise.defects
     times = range(1000, 1000 * (ticks + 1) + 1, 1000 if reference == "previous_sample" else 25_000)
@@ -237,7 +237,7 @@ def test_stuck_pixels_see_nothing_and_the_others_what_they_saw():
     assert all_of_them.size == 2 * SIDE * SIDE
     stuck = broken.evs.defects.stuck
     np.testing.assert_array_equal(fewer, all_of_them[~np.isin(place(all_of_them), stuck)])
-    moving = {"evs.reference": "last_event", "evs.photoreceptor_cutoff_hz": 300.0}
+    moving = {"evs.reference": "last_event", "evs.noise_cutoff_hz": 300.0}
     asynchronous = hr.load_sensor("reference-mono", {
         "geometry.rows": SIDE, "geometry.cols": SIDE, "evs.coefficients": SILENT,
         "evs.defects": {"stuck_share": 0.1}, **moving,
@@ -249,7 +249,7 @@ def test_stuck_pixels_see_nothing_and_the_others_what_they_saw():
 @pytest.mark.parametrize("reference", ("previous_sample", "last_event"))
 def test_events_of_defects_are_the_same_bits_however_a_run_is_cut(reference):
     """Split in two, cropped, and for an asynchronous sensor sampled at other times."""
-    extra = {"evs__reference": reference, "evs__photoreceptor_cutoff_hz": 300.0}
+    extra = {"evs__reference": reference, "evs__noise_cutoff_hz": 300.0}
     given = sensor(evs__defects=DEFECTS, **extra)
     times = list(range(1000, 61_000, 1000))
     whole = step_through(EvsStage(given.evs, 5), times)
@@ -275,7 +275,7 @@ def test_hot_events_wait_for_the_dead_time():
     given = sensor(
         evs__defects=spec,
         evs__reference="last_event",
-        evs__photoreceptor_cutoff_hz=300.0,
+        evs__noise_cutoff_hz=300.0,
         evs__refractory_period_us=2000,
     ).evs
     events = step_through(EvsStage(given, 5), [0, 100_000, 200_000, 300_000])

@@ -25,6 +25,7 @@ from hesim_render.recording.recording import Recording
 from hesim_render.recording.showcase import binned
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.specs import SensorSpec, read_scene
+from hesim_render.spectral.spectrum import illuminant
 
 ROOT = Path(__file__).parents[2]
 SENSORS = ("eiger", "gen2", "mipi-hybridevs", "davis346", "reference-mono", "reference-bayer")
@@ -399,3 +400,34 @@ def test_manifest_knows_the_files_a_scene_is_made_of(tmp_path):
     scene, sensor = hr.load_scene(tmp_path / "scene.yaml"), hr.load_sensor("reference-mono").crop(8, 8)
     manifest = hr.simulate(scene, sensor, duration_s=0.001, samples=2).manifest
     assert manifest["scene"]["files_sha256"] == {"plate.obj": hashlib.sha256(mesh.read_bytes()).hexdigest()}
+
+
+SKY = """light: {type: environment, file: sky.exr, illuminance_lux: 100}
+camera: {fit: target}
+target: {type: patch-chart, width_m: 0.2, height_m: 0.1, rows: 1, cols: 2, patches: patches.csv}
+"""
+BOX = "mitsuba: {file: box.xml}\ncamera: {origin_m: [0, 0, 1]}\n"
+
+
+@pytest.mark.parametrize(("scene", "files"), [
+    (SKY, {"sky.exr": "a sky", "patches.csv": "name,L,a,b\none,50,1,2\nother,60,3,4\n"}),
+    (BOX, {"box.xml": "<scene/>"}),
+])  # fmt: skip
+def test_manifest_knows_the_files_of_lights_charts_and_mitsuba_scenes(scene, files, tmp_path):
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "s.yaml").write_text(f"schema_version: 1\nname: s\ndescription: files\n{scene}")
+    hashes = manifests._file_hashes(read_scene(tmp_path / "s.yaml"))
+    assert hashes == {name: hashlib.sha256(text.encode()).hexdigest() for name, text in files.items()}
+
+
+def test_white_is_that_of_lamps_where_nothing_else_shines():
+    sensor, given = hr.load_sensor("eiger").crop(16, 16), {"seed": 1, "duration_us": 10, "settings": {"clean": True}}
+    scene = read_scene("integrating-sphere", {"light": {"type": "none"}, "target.illuminant": "A"})
+    neutral = manifests.build(sensor, scene=scene, **given)["mosaic"]["neutral"]
+    assert neutral == describe(sensor, illuminant("A")).neutral
+    assert neutral != manifests.build(sensor, scene=None, **given)["mosaic"]["neutral"]
+    # a light of the scene comes first
+    light = {"type": "uniform", "illuminance_lux": 9, "illuminant": "A"}
+    scene = read_scene("integrating-sphere", {"light": light, "target.illuminant": "D65"})
+    assert manifests.build(sensor, scene=scene, **given)["mosaic"]["neutral"] == neutral

@@ -38,7 +38,7 @@ class Stage:
 
 def pixels(**given):
     """Event pixels with unlike numbers: asynchronous, or with ticks where `tick_us` is given."""
-    spec = {"tick_us": None, "photoreceptor": None, "photoreceptor_cutoff_hz": 230.0, "refractory_period_us": None}
+    spec = {"tick_us": None, "photoreceptor": None, "noise_cutoff_hz": 230.0, "refractory_period_us": None}
     spec |= {"contrast_threshold_on": 0.23, "contrast_threshold_off": 0.31} | given
     kind = "last_event" if spec["tick_us"] is None else "previous_sample"
     return SimpleNamespace(reference=kind, **spec)
@@ -60,7 +60,7 @@ def bench(spec, corner_hz=None):
 def test_half_periods_let_pixels_settle():
     """A period of the corner frequency, four dead times and 2 ms; four ticks of pixels that have them."""
     assert bench(pixels())._half_us(70.0) == math.ceil(1e6 / 230)
-    assert bench(pixels(photoreceptor_cutoff_hz=7000.0))._half_us(70.0) == 2000
+    assert bench(pixels(noise_cutoff_hz=7000.0))._half_us(70.0) == 2000
     assert bench(pixels(refractory_period_us=1300))._half_us(70.0) == 5200
     assert bench(pixels(tick_us=170, refractory_period_us=9000))._half_us(70.0) == 680
     follows = SimpleNamespace(cutoff_hz=400.0, follows_light=True)
@@ -179,7 +179,7 @@ def test_progress_of_a_bench_rises_to_its_end(monkeypatch):
     """From the first recording to the last; lights that pixels would take too long for, or do not answer, are left
     out."""
     told = []
-    made = bench(pixels(photoreceptor_cutoff_hz=2.0))
+    made = bench(pixels(noise_cutoff_hz=2.0))
     made._progress = lambda what, part: told.append(part)
     shown = []
     made._one_light = lambda lux, pairs: shown.append(lux) or (1.0 if lux > 50 else 0.24)

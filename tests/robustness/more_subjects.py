@@ -56,7 +56,8 @@ def lens(folder):
         "lens:\n  f_number: 4.0\n  focal_length_mm: 16.0\n  relative_illumination: cos4\n"
         "  distortion: {model: opencv, k1: -0.2, k2: 0.05, p1: 0.001}\n  depth_of_field: true\n  diffraction: true\n"
         "  psf: {type: measured, file: psf.npy, sample_um: 2.5, image_height_mm: [0, 1.5, 3]}\n"
-        "  lateral_chromatic: {wavelength_nm: [400, 550, 700], relative: [0.0005, 0, -0.0005]}\n  veiling_glare: 0.02\n"
+        "  lateral_chromatic: {wavelength_nm: [400, 550, 700], magnification_rel: [0.0005, 0, -0.0005]}\n"
+        "  veiling_glare: 0.02\n"
     )
     (folder / "s.yaml").write_text(text[:begin] + own + text[end:])
     shutil.copy(_SHIPPED / "sensors" / "imx636.yaml", folder / "sheet.yaml")

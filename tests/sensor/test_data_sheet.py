@@ -171,7 +171,7 @@ def test_the_coefficients_have_the_figures_of_the_sheet():
     # shot noise of light and dark current: σ² of 5 lx over that of 20 lx is (20 + L0)/(5 + L0)
     variance = {lux: (beta.beta3**2 * lux + beta.beta4**2) / (lux + 0.08) ** 2 for lux in (5.0, 20.0)}
     assert variance[5.0] / variance[20.0] == pytest.approx(20.08 / 5.08)
-    assert evs.photoreceptor.filters_noise and evs.photoreceptor_cutoff_hz == 60
+    assert evs.photoreceptor.filters_noise and evs.noise_cutoff_hz == 60
     assert evs.photoreceptor.min_cutoff_hz == pytest.approx(corner_at(evs.photoreceptor, 5) * 0.08 / 5.08)
 
 
@@ -275,11 +275,11 @@ def test_every_sheet_that_ships_gives_its_own_rates(name):
     sheet, (beta,) = evs.data_sheet, evs.coefficients
     for level in sheet.background:
         corner_hz = corner_at(evs.photoreceptor, level.lux)
-        share = min(corner_hz / evs.photoreceptor_cutoff_hz, 1)
+        share = min(corner_hz / evs.noise_cutoff_hz, 1)
         sigma = math.sqrt((beta.beta3**2 * level.lux + beta.beta4**2) * share) / (level.lux + beta.beta2)
         on, off = noise_rates_hz(
             (evs.contrast_threshold_on, evs.contrast_threshold_off), evs.threshold_mismatch_rel, sigma,
-            share * evs.photoreceptor_cutoff_hz, evs.refractory_period_us * 1e-6, sheet.leak_hz,
+            share * evs.noise_cutoff_hz, evs.refractory_period_us * 1e-6, sheet.leak_hz,
         )  # fmt: skip
         assert on + off + sheet.leak_hz == pytest.approx(level.rate_hz, rel=1e-3)
     # the step that crosses the threshold after the stated time, solved and not by the inverse formula

@@ -40,7 +40,7 @@ def test_crop_keeps_each_pixels_place_on_the_chip():
 
 
 def test_vignetting_table_is_linear_in_image_height():
-    table = {"image_height_mm": [0.0, 1.0, 2.0], "relative": [1.0, 0.9, 0.5]}
+    table = {"image_height_mm": [0.0, 1.0, 2.0], "illumination_rel": [1.0, 0.9, 0.5]}
     sensor = hr.load_sensor("eiger", {"lens.relative_illumination": table})
     x, y = optics.pixel_centres_mm(sensor.layout)
     height = np.hypot(x[2000], y[1224])

@@ -427,6 +427,27 @@ def test_means_over_parts_of_a_microsecond_weight_the_pieces_by_their_lengths():
     assert np.array(nothing[0]).size == 0
 
 
+def test_a_source_that_weights_its_means_itself_is_asked_once():
+    """Within 3250 µs the light is on for 750 µs from 0 and from 2500 µs: the flux of these times is that at 1625 µs."""
+    light = Pwm(400, 0.3)
+
+    class Weighted(Formula):
+        def mean_flux(self, pixel, begin_us, end_us):
+            return super().mean_flux(pixel, 1625.0, 1625.0)
+
+    own, plain = Weighted(slope_per_s=300.0), Formula(slope_per_s=300.0)
+    own.light = light
+    for source in (own, plain):
+        halves = FlickerFlux([light], [source]).mean_flux(np.arange(3, dtype=np.uint32), 0.0, 3250.0)
+        np.testing.assert_allclose(np.mean(halves, axis=0), 1e5 * (1 + 300 * 1625e-6) * 1500 / 3250 / 0.3, rtol=1e-5)
+    assert len(own.asked) == 1 < len(plain.asked)
+    # weighted by another light, it is cut at the jumps as any other
+    own.light = Pwm(400, 0.4)
+    own.asked.clear()
+    FlickerFlux([light], [own]).mean_flux(np.arange(3, dtype=np.uint32), 0.0, 3250.0)
+    assert len(own.asked) > 1
+
+
 def test_windows_that_straddle_slices_have_the_mean_of_their_parts():
     class Sliced(Formula):
         def slice_edges_us(self, begin_us, end_us):

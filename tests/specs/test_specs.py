@@ -91,7 +91,7 @@ MISTAKES = [
     ("quantum_efficiency: 0.7", "quantum_efficiency: {flat: 0.5, band_nm: [900, 1000]}", "filters.red",
      "do not overlap"),
     ("f_number: 2.0", "f_number: 0", "lens.f_number", "greater than or equal to 0.1"),
-    ("relative_illumination: cos4", "relative_illumination: {image_height_mm: [0, 1], relative: [1, 2]}",
+    ("relative_illumination: cos4", "relative_illumination: {image_height_mm: [0, 1], illumination_rel: [1, 2]}",
      "lens.relative_illumination", "[0, 1]"),
     ("window_us: 1000", "window_us: 2000", "evs.window_us", "longer than tick_us"),
     ("beta2: 5.0e-3", "beta2: 0", "evs.coefficients.0.beta2", "greater than or equal to"),
@@ -292,10 +292,10 @@ def test_all_mistakes_of_a_file_are_told_at_once_in_order_of_lines(tmp_path):
 
 def test_a_mistake_in_one_of_several_alternatives_is_told_once(tmp_path):
     with pytest.raises(SpecError, match="image_height_mm must start") as caught:
-        read_sensor("eiger", {"lens.relative_illumination": {"image_height_mm": [2, 1], "relative": [1, 1]}})
+        read_sensor("eiger", {"lens.relative_illumination": {"image_height_mm": [2, 1], "illumination_rel": [1, 1]}})
     assert caught.value.problems == ()
     with pytest.raises(SpecError, match=r"image_height: unknown key \(did you mean 'image_height_mm'\?\)") as caught:
-        read_sensor("eiger", {"lens.relative_illumination": {"image_height": [0, 1], "relative": [1, 1]}})
+        read_sensor("eiger", {"lens.relative_illumination": {"image_height": [0, 1], "illumination_rel": [1, 1]}})
     assert "\n" not in str(caught.value)
 
 

@@ -135,12 +135,12 @@ _LOOK_AT = {
     "times": (
         "event times",
         "events in the later time bins after a step do not come as noise of one bandwidth brings them: "
-        "photoreceptor_cutoff_hz is off. Look for steps that end late in the pixel (its signal bandwidth), latency of "
+        "noise_cutoff_hz is off. Look for steps that end late in the pixel (its signal bandwidth), latency of "
         "the read-out, or light that flickers.",
     ),
     "steady": (
         "noise rate",
-        "events in steady light are not those of the noise that the S-curves have: photoreceptor_cutoff_hz, noise "
+        "events in steady light are not those of the noise that the S-curves have: noise_cutoff_hz, noise "
         "and leak may be off. Look for events that come by themselves (hot neighbours, flicker of the lamp, light that "
         "drifts), a dark level that is not dark, or another bias than that of the steps.",
     ),

@@ -52,7 +52,7 @@ def content(result: AsynchronousCalibration) -> dict[str, Any]:
         "threshold_mismatch_rel": result.mismatch.described() | {"from": "trials after a reset"},
         "threshold_mismatch_on_rel": estimated(fit.value("mismatch_on"), fit.error("mismatch_on"), "relative std"),
         "threshold_mismatch_off_rel": estimated(fit.value("mismatch_off"), fit.error("mismatch_off"), "relative std"),
-        "photoreceptor_cutoff_hz": estimated(fit.value("cutoff_hz"), fit.error("cutoff_hz"), "Hz"),
+        "noise_cutoff_hz": estimated(fit.value("cutoff_hz"), fit.error("cutoff_hz"), "Hz"),
         "leak_rate_hz": estimated(fit.value("leak_hz"), fit.error("leak_hz"), "Hz, ON events")
         if fit.free[LEAK]
         else {"value": 0.0, "note": _NO_LEAK},

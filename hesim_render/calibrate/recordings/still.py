@@ -247,8 +247,8 @@ def hot_pixels(tallies: Sequence[EventTally]) -> NDArray[np.bool_]:
     stands_out = counts > limit
     rate_hz = counts / seconds
     least_hz = np.where(stands_out, rate_hz, np.inf).min(axis=0)
-    hidden = (least_hz * seconds <= limit) & (rate_hz >= 0.5 * least_hz)
-    return np.asarray(stands_out.any(axis=0) & np.all(stands_out | hidden, axis=0))
+    masked = (least_hz * seconds <= limit) & (rate_hz >= 0.5 * least_hz)
+    return np.asarray(stands_out.any(axis=0) & np.all(stands_out | masked, axis=0))
 
 
 def hot_share(tallies: Sequence[EventTally]) -> dict[str, Any]:

@@ -259,7 +259,7 @@ def _rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
     names = {
         "theta": "θ, mean of both", "theta_on": "θ₊", "theta_off": "θ₋", "threshold_mismatch_rel": "threshold mismatch",
         "threshold_mismatch_on_rel": "mismatch of θ₊", "threshold_mismatch_off_rel": "mismatch of θ₋",
-        "photoreceptor_cutoff_hz": "noise bandwidth f_c", "leak_rate_hz": "leak",
+        "noise_cutoff_hz": "noise bandwidth f_c", "leak_rate_hz": "leak",
     }  # fmt: skip
     rows = [parameter_row(text, section[key]) for key, text in names.items()]
     rows += [parameter_row(f"noise σ at {item['signal_dn']:.4g} DN", item) for item in section["noise"]]

@@ -37,6 +37,7 @@ class DeviceMaps:
         self._layout = layout
         terms = None
         if beta is not None:
+            # a coefficient that is the same at all places of the tile stays a number
             uniform = np.all(beta == beta[:1, :1], axis=(0, 1))
             tiled = layout.tiled(beta)
             terms = tuple(to_device(beta[0, 0, k] if uniform[k] else tiled[..., k]) for k in range(6))
@@ -88,6 +89,7 @@ def draw_dn(
     value = noise.value(electrons, dr.opaque(types.Float, exposure_us * S_PER_US), pixels, device_namespace())
 
     key = maps.keys(index)
+    # one generator a pixel and frame, so that no value depends on the region or on the order
     generator = philox(seed, Stream.APS, key, frame)
     word = generator.next_uint32x4()
     if spec.law == "poisson":
@@ -97,12 +99,14 @@ def draw_dn(
         shot, deviate = normal_pair(word[0], word[1])
         counts = dr.fma(dr.sqrt(value.count), shot, value.count)
     if noise.read_noise_correlation != 0:
+        # the deviate of the pixel before it in the row, drawn again from its own key
         before = philox(seed, Stream.APS, key - 1, frame).next_uint32x4()
         earlier = (
             normal_pair(before[2], before[3])[0] if spec.law == "poisson" else normal_pair(before[0], before[1])[1]
         )
         own, other = _weights(noise.read_noise_correlation)
         deviate = dr.fma(dr.opaque(types.Float, own), deviate, dr.opaque(types.Float, other) * earlier)
+    # the well clips what is collected; offset and read noise come after it
     full_well_dn = spec.full_well_e * spec.system_gain_dn_per_e
     level: Float = dr.minimum(dr.fma(value.gain_dn, counts, value.fixed_dn), full_well_dn) + pixels.offset_dn
     level = dr.fma(dr.sqrt(types.Float(value.gaussian_dn2)), deviate, level)

@@ -51,6 +51,7 @@ class TelegraphPixels:
         """Deviations from the mean in a frame, DN [n]: a pure function of seed, device and frame."""
         every = np.arange(self.place.size)
         signal = Telegraph(seed, Stream.TELEGRAPH, self.key, self.change_hz, self.high_share)
+        # two levels about a mean of 0, and which of them holds at the time of the frame
         high = signal.is_high(every, np.full(every.size, frame * self.frame_us))
         return np.where(high, *formulas.telegraph_levels(self.amplitude_dn, self.high_share)[::-1])
 
@@ -64,6 +65,7 @@ class TelegraphPixels:
         index : pixels that are asked for.
         """
         types = jit()
+        # few pixels have this noise: the host computes them, and zeros fill the region
         every = dr.zeros(types.Float, pixels)
         values = types.Float(self.values_dn(seed, frame).astype(np.float32))
         dr.scatter(every, values, types.UInt32(self.place.astype(np.uint32)))
@@ -79,15 +81,18 @@ def telegraph_pixels(spec: ApsSpec, layout: Layout, device_seed: int) -> Telegra
     if measured is not None:
         every = measured.amplitude_dn, measured.high_share, measured.change_hz
         amplitude, share, change_hz = (values.ravel().astype(np.float64) for values in every)
+        # an amplitude of 0 says that a pixel has none
         place = np.flatnonzero(amplitude > 0)
         result = amplitude[place], share[place], change_hz[place]
     elif spec.telegraph is not None:
         given = spec.telegraph
         key = layout.full_index.ravel()
+        # which pixels have it, and how much, is a property of the device: no value depends on the region
         place = np.flatnonzero(device_uniform(device_seed, Stream.TELEGRAPH_SHARE, key) < given.share)
         amplitude = np.full(place.size, spec.system_gain_dn_per_e * given.amplitude_e)
         if given.amplitude_law == "exponential":
             amplitude *= -np.log(device_uniform(device_seed, Stream.TELEGRAPH_AMPLITUDE, key[place]))
+        # mean times in both states give the share of the high one and the rate of change
         share = np.full(place.size, given.high_s / (given.high_s + given.low_s))
         change_hz = np.full(place.size, 1.0 / given.high_s + 1.0 / given.low_s)
         result = amplitude, share, change_hz

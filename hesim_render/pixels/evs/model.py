@@ -191,7 +191,7 @@ class EvsNoise(PlainState):
         thresholds = self.threshold_on_map, self.threshold_off_map
         return EventPixels(
             self.layout, self.table, self.spec.shot_law, thresholds, self._reference_level,
-            self.photoreceptor if self.filters_noise else None, self.spec.photoreceptor_cutoff_hz,
+            self.photoreceptor if self.filters_noise else None, self.spec.noise_cutoff_hz,
         )  # fmt: skip
 
     @property
@@ -215,7 +215,7 @@ class EvsNoise(PlainState):
         """
         if not self.filters_noise:
             return 1.0
-        bandwidth_hz = self.spec.photoreceptor_cutoff_hz
+        bandwidth_hz = self.spec.noise_cutoff_hz
         assert bandwidth_hz is not None
         return np.minimum(self.corner_hz(electrons, position, bandwidth_hz) / bandwidth_hz, 1.0)
 

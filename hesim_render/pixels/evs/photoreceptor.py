@@ -88,9 +88,9 @@ class Photoreceptor:
     @property
     def noise_rate_per_us(self) -> Float:
         """a of the noise in the present light, 1/µs: a number, or one per pixel. Where the corner comes to its limit
-        gradually, that of the noise is photoreceptor_cutoff_hz.
+        gradually, that of the noise is noise_cutoff_hz.
         """
-        bandwidth_hz = self._noise.spec.photoreceptor_cutoff_hz or 0.0
+        bandwidth_hz = self._noise.spec.noise_cutoff_hz or 0.0
         return _rate(self._noise.on_device.corner_hz(self._input, self._spec, bandwidth_hz))
 
     def _node_at(self, t_us: float) -> int:

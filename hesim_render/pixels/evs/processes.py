@@ -3,7 +3,7 @@
 Both are functions of the seed, the pixel and the time of the first sample. They do not depend on how often they are
 asked.
 
-Where the bandwidth of the noise differs from pixel to pixel, with f_c the ``photoreceptor_cutoff_hz``, z a normal
+Where the bandwidth of the noise differs from pixel to pixel, with f_c the ``noise_cutoff_hz``, z a normal
 deviate of the pixel, r and c of `NoiseSpreadSpec`::
 
     f = f_c · exp(bandwidth_rel · z) · (1 ± r)(1 ± c)
@@ -55,7 +55,7 @@ class BandNoise:
     STATE = ("_node", "_value", "_state")
 
     def __init__(self, noise: EvsNoise, seed: int, photoreceptor: Photoreceptor | None = None) -> None:
-        cutoff_hz = noise.spec.photoreceptor_cutoff_hz
+        cutoff_hz = noise.spec.noise_cutoff_hz
         assert cutoff_hz is not None
         self._key, self._seed = noise.on_device.key, seed
         self._period_us = US_PER_S / (NODES_PER_CUTOFF_PERIOD * cutoff_hz * most_bandwidth(noise))
@@ -229,13 +229,13 @@ class RandomEvents:
 
 
 def most_bandwidth(noise: EvsNoise) -> float:
-    """Largest bandwidth of a pixel's noise over photoreceptor_cutoff_hz."""
+    """Largest bandwidth of a pixel's noise over noise_cutoff_hz."""
     spread = noise.spec.noise_spread
     return 1.0 if spread is None or "mismatch" in noise.off else spread.most
 
 
 def bandwidth_map(noise: EvsNoise) -> NDArray[np.float32] | None:
-    """Bandwidth of each event pixel's noise over photoreceptor_cutoff_hz, row-major; None where all are alike."""
+    """Bandwidth of each event pixel's noise over noise_cutoff_hz, row-major; None where all are alike."""
     spread, layout = noise.spec.noise_spread, noise.layout
     if spread is None or "mismatch" in noise.off:
         return None

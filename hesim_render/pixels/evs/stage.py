@@ -163,6 +163,7 @@ class EvsStage:
             raise RangeError("t_us", t_us, f"a time after the last sample, {self._t_us}")
         self._t_us = int(t_us)
         events = self._mode.step(electrons, self._t_us)
+        # until here the size of the polarity says where an event comes from, see `labels`
         origin = np.abs(events["polarity"])
         events["polarity"] = np.sign(events["polarity"])
         kept = None if self._readout is None else self._readout.admitted(events)
@@ -220,6 +221,7 @@ class EventReadout:
             return np.zeros(0, np.bool_)
         t_us = events["t_us"].astype(np.int64)
         row = (events["y"] - scan_start_row(t_us, self._rows)) % self._rows
+        # the order in which the arbiter serves them
         order = np.lexsort((events["x"], row, t_us))
         clock = np.floor(t_us * self._rate_hz / US_PER_S).astype(np.int64)
         kept = np.empty(events.size, dtype=bool)
@@ -229,6 +231,7 @@ class EventReadout:
 
     def _admit(self, clock: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether the buffer has room for each event, in order; `clock` [event] is the time in clock ticks."""
+        # the bus takes one event a clock tick from what waits
         served = np.diff(clock, prepend=self._clock)
         added = np.cumsum(1 - served)
         # content of the buffer just after each event if it had no limit; it is never negative

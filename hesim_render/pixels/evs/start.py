@@ -225,7 +225,7 @@ def start_of(
     part = (z - low).astype(np.float32)
     reference, dead_share, events_hz = np.zeros(chance.size, np.float32), np.zeros(chance.size), np.zeros(chance.size)
     # what resets a pixel besides its events, and for how long it is dead after one
-    bandwidth_hz, period_us = noise.spec.photoreceptor_cutoff_hz, noise.refractory_period_us
+    bandwidth_hz, period_us = noise.spec.noise_cutoff_hz, noise.refractory_period_us
     assert bandwidth_hz is not None
     bandwidth_hz *= most_bandwidth(noise)
     dead_s = (period_us or 0) / US_PER_S

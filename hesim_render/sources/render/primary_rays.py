@@ -49,7 +49,7 @@ class RayFactory:
         self._shrink = None
         if optics.lateral_chromatic is not None:
             chromatic, grid = optics.lateral_chromatic, np.arange(RENDERABLE_NM[0], RENDERABLE_NM[1] + 1)
-            larger = np.interp(grid, chromatic.wavelength_nm, chromatic.relative)
+            larger = np.interp(grid, chromatic.wavelength_nm, chromatic.magnification_rel)
             self._shrink = table(types.Float, (1 / (1 + larger)).astype(np.float32))
             dr.make_opaque(self._shrink)
         self.is_dispersive = self._airy is not None or self._shrink is not None

@@ -195,14 +195,17 @@ class _DeviceDistortion:
         The last residual is computed in float64: rounding of the model would be 0.001 px at the border of a fisheye.
         """
         types = jit()
+        # beyond the limit of the model: the place at the limit in the same direction
         distance = dr.sqrt(u * u + v * v)
         inside = dr.minimum(types.Float64(self._most) / dr.maximum(distance, 1e-30), 1)
         u, v, distance = u * inside, v * inside, types.Float(distance * inside)
+        # start: the tangent over the place, by the table, between two of its entries
         at = dr.minimum(distance / self._most * (_STARTS - 1), _STARTS - 1)
         cell = dr.minimum(types.UInt32(at), _STARTS - 2)
         low, high = (dr.gather(types.Float, self._ratio, cell + k) for k in (0, 1))
         start = dr.fma(at - types.Float(cell), high - low, low)
         x, y = types.Float(u) * start, types.Float(v) * start
+        # the Jacobian is symmetric, so three numbers invert it
         for last in [False] * _STEPS + [True]:
             kind = types.Float64 if last else types.Float
             projected_u, projected_v, xx, xy, yy = self._formula(kind(x), kind(y), exact=last)

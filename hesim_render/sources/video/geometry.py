@@ -43,12 +43,14 @@ def axis(pixels: int, source: int, scale: float) -> Axis:
     begin = (source - pixels * scale) / 2
     if scale == 1:
         begin = float(np.floor(begin))  # keeps whole pixels whole if an odd number of them is cut off
+    # borders between footprints, in source pixels; nearly whole ones are whole, so that no tap has a weight of rounding
     edges = np.clip(begin + np.arange(pixels + 1) * scale, 0, source)
     edges = np.where(np.abs(edges - np.rint(edges)) < 1e-9 * source, np.rint(edges), edges)
     low, high = edges[:-1], edges[1:]
     first = np.minimum(np.floor(low), source - 1)
     taps = int(np.max(np.ceil(high) - first))
     place = first[:, None] + np.arange(taps)
+    # overlap of each source pixel with the footprint, [pixel, tap]
     share = np.clip(np.minimum(place + 1, high[:, None]) - np.maximum(place, low[:, None]), 0, None)
     return Axis(
         first.astype(np.uint32), (share / share.sum(axis=1, keepdims=True)).astype(np.float32), scale, float(begin)
@@ -127,6 +129,7 @@ class Resampler:
             return planes
         dr.eval(planes)
         rows, cols = self._shape
+        # rows first: the planes then have the rows of the region and the columns of the picture
         if not self._mapping.rows.is_plain:
             index = dr.arange(types.UInt32, rows * self._width)
             row = index // self._width

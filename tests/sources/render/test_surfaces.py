@@ -125,7 +125,7 @@ def test_objects_that_shine_flicker_apart():
     assert [kind is None for kind, _ in parts] == [True, False]
     shown = [[item.emission.luminance_cd_m2 for item in part.spec.objects] for _, part in parts]
     assert shown == [[0.0, 50.0], [100.0, 0.0]]
-    assert [light.is_lit for _, part in parts for light in part.spec.lights] == [True, False]
+    assert [light.is_on for _, part in parts for light in part.spec.lights] == [True, False]
 
 
 def test_a_moving_lamp_needs_the_exact_mode():

@@ -65,7 +65,7 @@ def test_off_the_axis_each_ray_has_its_own_cosine_law_once(f_number):
 
 
 def test_a_table_of_relative_illumination_takes_the_place_of_cos4():
-    table = {"image_height_mm": [0, 2.0], "relative": [1.0, 0.4]}
+    table = {"image_height_mm": [0, 2.0], "illumination_rel": [1.0, 0.4]}
     sensor = hr.load_sensor("reference-mono", {
         "lens.f_number": 1.4, "lens.focal_length_mm": 5.0, "lens.magnification": "focus",
         "lens.depth_of_field": True, "lens.relative_illumination": table})  # fmt: skip

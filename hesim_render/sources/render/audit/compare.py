@@ -52,9 +52,11 @@ def compare_ticks(
     spread = np.hypot(error[1:], error[:-1])
     counted = core[1:, None]
     for sign, theta in ((1.0, thresholds[0]), (-1.0, thresholds[1])):
+        # by how much each signal passes the threshold; above 0 it gives an event
         own, other = sign * change - theta, sign * wanted - theta
         is_in_run, is_true = own > 0, other > 0
         lost, added = is_true & ~_near(is_in_run), is_in_run & ~_near(is_true)
+        # beyond the stated error an event is missed or extra; within it, either may be right
         sure_lost, sure_added = lost & (other > SURE * spread), added & (own > SURE * spread)
         for total, which in (
             (true, is_true),
@@ -111,6 +113,7 @@ def compare_crossings(
                 extra += sure
                 flips += over & ~sure
                 in_run += over
+            # the reference may cross several levels within a step, and each event moves both signals on
             for _ in range(most):
                 crosses = ahead[k] > goal
                 if not crosses.any():
@@ -154,6 +157,7 @@ class Tally:
     def deviations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Deviations and weights of all examined units, in increasing order of deviation."""
         place, deviation, weight = (np.concatenate(values) for values in zip(*self._deviations, strict=True))
+        # units in their random order, up to the last of the part that was examined as a whole
         among = np.flatnonzero(place < self.looked_at)
         order = among[np.argsort(deviation[among])]
         return deviation[order], weight[order]

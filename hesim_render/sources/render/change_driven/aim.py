@@ -113,6 +113,7 @@ def in_blocks(
     aims, edges : small objects and edges of all pairs; None where there are none. A pair has one kind at most.
     shadows : codes of `LampShadows` of all pairs, 0 where none are known; None for none.
     """
+    # pairs sorted by kind: aimed at objects, about edges, neither
     plain = np.ones(packets.size, np.bool_)
     alike: list[tuple[NDArray[np.int64] | None, PairAims | PairEdges | None]] = []
     for kind, has_any in (
@@ -251,6 +252,7 @@ class Aim:
             square = self._square(group, now, camera, centre)
             return k + 1, density + dr.select(square.has(x, y), square.density, 0)
 
+        # the density of aimed rays at this place: the mean over the squares of all objects of the pair
         state = dr.zeros(types.UInt32, dr.width(x)), dr.zeros(types.Float, dr.width(x))
         _, density = dr.while_loop(state, lambda k, _: k < lanes.count, add, label="aimed rays")
         density = density / lanes.count
@@ -269,6 +271,7 @@ class Aim:
         if camera is not None:
             middle = camera.to_rest(middle)
         col, row, px_per_m = self._rays.seen(middle)
+        # the ball in the picture, a little wider, and no further than rays of this pixel may start
         reach = _WIDER * ball.w * px_per_m + _ROUNDING_PX
         half, seen = self._rays.reach_px, px_per_m > 0
         sides = []

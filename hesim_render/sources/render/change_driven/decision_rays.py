@@ -104,6 +104,7 @@ class DecisionRays(PacketTracer):
             lanes = pixel[part], window[part].astype(np.uint32), repeat
             own = packets[part]
             rays, _ = self._started(lanes, own, own * PACKET, moments, key, footprint, None)
+            # codes of the shapes, [pair · ray]; the most frequent one among the rays of a pair counts
             met = np.array(self._integrator.shadows_of(self._sampler, rays.ray, rays.now))
             self._sampler.rest()
             out[part] = most_frequent(met.reshape(repeat.size, _SHADOW_RAYS))
@@ -140,21 +141,26 @@ class DecisionRays(PacketTracer):
             traced = self._packets_of(*given, is_weighted=False, shadows=known)
             types = jit()
             by_control = spread_out(types.UInt32, controlled[some].astype(np.uint32), pair_of_rays(packets))
+            # place in the pixel, instant from the middle of the window, and flux by the estimator of the pair
             values = [*traced.place, traced.share - 0.5, dr.select(by_control != 0, traced.fluxes[0], traced.fluxes[1])]
             dr.eval(values)
             return values
 
         every, half = np.arange(lanes[0].size), samples // 2
+        # half of the rays of every pair: most show little contrast, and have nothing to fit a line to
         first, fit = decision_rays(every, half, 0), EdgeFit.empty(every.size)
         fit.put(slice(None), first, half, moves)
         uneven = np.flatnonzero(fit.high - fit.low >= least)
         if uneven.size:
+            # the other half, where there is contrast: a line needs more rays on both sides
             both = joined_rays(first, uneven, decision_rays(uneven, half, 1), half)
             better = EdgeFit.empty(uneven.size)
             better.put(slice(None), both, samples, moves)
             lines = np.flatnonzero(better.is_line)
             if lines.size:
                 refined = EdgeFit.empty(lines.size)
+                # about this line, in a strip that holds all lines which these rays allow: rays elsewhere say nothing
+                # of its place
                 more = decision_rays(uneven[lines], samples, 2, better.models(lines, wider=True))
                 refined.put(slice(None), joined_rays(both, lines, more, samples), 2 * samples, moves)
                 better.replace(lines, refined)

@@ -51,6 +51,7 @@ def about_edges(
     rays : [n], powers of two, never more than before.
     edges : models of all pairs; None where no pair has one.
     """
+    # decision rays cost as much as a cheap pair
     is_worth_it = rays >= tuning.edge_least_rays
     if known is not None:
         is_worth_it |= known[0]
@@ -58,6 +59,7 @@ def about_edges(
     if place.size == 0:
         return rays, None
     pixel, window, windows = pairs
+    # lines that are known from following edges are taken, all others are fitted now
     fit, new = EdgeFit.empty(place.size), np.arange(place.size)
     if known is not None:
         fit.replace(np.flatnonzero(known[0][place]), known[1])
@@ -68,6 +70,7 @@ def about_edges(
     of = pixel[some], window[some], windows, tuning.edge_rays, tuning.edge_footprint_px, controlled[some], little
     moves = tracer.moves_within(windows)
     fit.replace(new, tracer.edges(*of, stream, moves, None if shadows is None else shadows[some]))
+    # from here on in wanted errors: contrast, and rays by the law of stratified scatter
     contrast = (fit.high - fit.low) / wanted
     is_edge = fit.is_edge & (contrast >= 1)
     # both sides belong to the scatter of a pair that has no edge; of few rays, the rarer side may have two more in 68
@@ -83,6 +86,7 @@ def about_edges(
     part = tuning.flat_part if flat_part is None else flat_part
     needed = np.where(is_flat, np.maximum(needed, part * rays[place].astype(np.float32)), needed)
     least = np.where(is_flat, tuning.edge_rays // 2, tuning.edge_rays)
+    # the next power of two, which counts where it is below what the law of errors asks for
     needed = np.clip(np.maximum(needed, floor[place]), least, tuning.most_rays)
     fewer = 1 << np.ceil(np.log2(needed)).astype(np.int64)
     # all other pairs, such as corners and penumbrae of short windows, keep the rays of the law

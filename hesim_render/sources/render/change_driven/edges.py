@@ -198,6 +198,7 @@ def joined_rays(first: Sequence[Float], pairs: NDArray[np.int64], more: Sequence
     rays : a power of two.
     """
     types = jit()
+    # of each pair the rays of the first set, then those of the second
     half = dr.arange(types.UInt32, 2 * rays * pairs.size) // dr.opaque(types.UInt32, rays)
     within = dr.arange(types.UInt32, 2 * rays * pairs.size) - half * dr.opaque(types.UInt32, rays)
     is_first, pair = half % 2 == 0, half // 2
@@ -275,6 +276,7 @@ class LaneEdges:
         distance = dr.fma(self.normal_x, x, dr.fma(self.normal_y, y, offset))
         _, own_length = self._inside(distance - offset)
         inside = (self.is_strip | (abs(distance) <= self.half_width)) & (own_length > 0) & is_met
+        # density of the rays of the strip here, beside that of 1 of the uniform ones: weights by the balance heuristic
         density = dr.select(inside, dr.rcp(2 * self.half_width * own_length), 0)
         density = dr.select(moves & inside, density * dr.rcp(span), density)
         weight = dr.select(is_strip | ~self.is_strip, 2 / (1 + density), 0)

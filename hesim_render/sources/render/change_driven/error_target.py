@@ -62,6 +62,7 @@ class Noise:
         """
         row, col = np.divmod(index.astype(np.int64), self._sensor.spec.geometry.cols)
         rows, cols = self._position.shape
+        # the tile repeats, so the place in it tells role and event position
         place = row % rows, col % cols
         if self._sensor.spec.evs is None:
             return self._frame_unit()
@@ -74,6 +75,7 @@ class Noise:
 
         def unit(flux: NDArray[np.float32]) -> NDArray[np.float32]:
             of_frames, of_events = frames(flux), events(flux)
+            # a value that serves frames and events must satisfy the quieter of the two
             either = np.where(is_both, np.minimum(of_frames, of_events), of_frames)
             return np.where(is_frame, either, of_events)
 
@@ -102,12 +104,14 @@ class Noise:
         first, step, counts = [], [], []
         for axis, size in enumerate((geometry.rows, geometry.cols)):
             tile, own = self._position.shape[axis], sorted({place[axis] for place in places})
+            # a lattice along this axis: places at equal distances that divide the tile
             distance, rest = divmod(tile, len(own))
             if rest or any(each != own[0] + k * distance for k, each in enumerate(own)):
                 return None
             first.append(own[0])
             step.append(distance)
             counts.append(len(range(own[0], size, distance)))
+        # both axes are regular, but not every crossing has the role
         if len(places) * step[0] * step[1] != self._position.size:
             return None
         return Lattice(counts[0], counts[1], (first[0], first[1]), (step[0], step[1]), geometry.cols)

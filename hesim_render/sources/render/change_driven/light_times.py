@@ -43,6 +43,7 @@ class LightParts:
         """Cut windows [w], µs. A window without any energy is one part of constant power."""
         knots = waveform.follow_us(float(begin_us.min()), float(end_us.max()))
         low, high = np.searchsorted(knots, begin_us, "right"), np.searchsorted(knots, end_us, "left")
+        # every knot inside a window cuts it once more; parts of all windows in one list, [part]
         counts = np.maximum(high - low, 0) + 1
         first = np.cumsum(counts) - counts
         window = np.repeat(np.arange(begin_us.size), counts)
@@ -52,18 +53,21 @@ class LightParts:
         left = np.where(place == 0, begin_us[window], knots[after - 1])
         right = np.where(place == counts[window] - 1, end_us[window], knots[after])
         middle = 0.5 * (left + right)
+        # exact means over both halves of a part give the power and its slope
         early, late = waveform.mean(left, middle), waveform.mean(middle, right)
         power, length = 0.5 * (early + late), right - left
         tilt = np.divide(2 * (late - early), power, out=np.zeros_like(power), where=power > 0)
+        # energy of each window, by which the energies of its parts become shares
         total = np.add.reduceat(power * length, first)
-        is_lit = (total > 0)[window]
+        has_energy = (total > 0)[window]
         # of a dark or empty window the first part is all of it: any instant will do, its power is 0 or its length is
-        energy = np.where(is_lit, power * length / np.where(is_lit, total[window], 1), place == 0)
-        length = np.where(is_lit, length, (end_us - begin_us)[window])
+        energy = np.where(has_energy, power * length / np.where(has_energy, total[window], 1), place == 0)
+        length = np.where(has_energy, length, (end_us - begin_us)[window])
         before = np.cumsum(energy) - energy
         before -= before[first][window]
+        # the search for an instant must not end in a part without energy
         last = np.maximum.reduceat(np.where(energy > 0, np.arange(window.size), 0), first)
-        tilt = np.where(is_lit, np.clip(tilt, -2, 2), 0)
+        tilt = np.where(has_energy, np.clip(tilt, -2, 2), 0)
         return cls(first, last, before, energy, left - begin_us[window], length, tilt)
 
 
@@ -115,6 +119,7 @@ class LightTimes:
             is_before = dr.gather(types.Float, self.energy_until, middle) > share
             return dr.select(is_before, low, middle + 1), dr.select(is_before, middle, high)
 
+        # the part in which the share falls, by bisection
         part, _ = dr.while_loop((low, high), lambda low, high: low < high, halve, label="light times")
         before, energy, begin, length = dr.gather(types.Array4f, self.rows, part)
         inside = dr.clip((share - before) / energy, 0, 1)

@@ -74,6 +74,7 @@ class Looks:
         sites : the sites; what shows the same in two looks, in all sites around, has kept its light between them.
         wanted : wanted error of each site; needed where `stride` is above 1.
         """
+        # coarse looks, then halves of those spans whose ends differ
         looks = [*range(0, self._last, stride), self._last]
         self._in_all(looks[1:-1])
         spans = [span for span in pairwise(looks) if span[1] - span[0] > 1]
@@ -83,6 +84,7 @@ class Looks:
                 # what comes from two pixels away takes the whole stride
                 radius = REACH - 1 if 2 * (late - early) > stride else 1
                 busy = np.flatnonzero(sites.near(self._differ(early, late, wanted), radius) & self._near)
+                # until a look says otherwise, all windows between show what the early one does
                 for between in range(early + 1, late):
                     self._keep(between, early)
                 windows.append(np.full(busy.size, (early + late) // 2))
@@ -105,6 +107,7 @@ class Looks:
     def _differ(self, early: int, late: int, wanted: Wanted | None) -> NDArray[np.bool_]:
         """Sites [site] that show something else in two windows, by the estimator of less scatter in the first."""
         tables = self.tables
+        # one estimator for both windows, so that a difference is one of the scene
         is_controlled = tables["controlled_scatter"][early] <= tables["plain_scatter"][early]
         begin, end = (np.where(is_controlled, tables["controlled"][k], tables["plain"][k]) for k in (early, late))
         return np.asarray(np.abs(end - begin) > least_change(begin, wanted))

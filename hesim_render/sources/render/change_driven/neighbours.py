@@ -75,6 +75,7 @@ class Board:
         """True at sites [m] at most `radius` fields away from a marked one [m], also diagonally."""
         image = self.image(marked, radius, False)
         rows, cols = self.shape
+        # along rows, then along columns: 4r steps in place of (2r + 1)²
         across = image[:, :cols].copy()
         for shift in range(1, 2 * radius + 1):
             across |= image[:, shift : shift + cols]
@@ -164,6 +165,7 @@ class Sites:
     def _sum(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         assert self.board is not None
         image = self.board.image(values, 1, 0.0)
+        # sums over three columns, then over three rows of these: the order of terms is the same for every crop
         across = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
         return self._at_listed(across[:-2] + across[1:-1] + across[2:])
 

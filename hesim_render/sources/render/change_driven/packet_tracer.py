@@ -195,9 +195,9 @@ class PacketTracer(Tracer):
         """
         rays, pair = self._started(lanes, packets, half_rays, moments, key, footprint, aims)
         types, now = jit(), rays.now
-        hidden = () if shadows is None else (spread_out(types.UInt32, shadows, pair),)
-        dr.eval(*hidden)
-        *fluxes, met = self._integrator.flux(self._sampler, rays.ray, now, rays.filter, *hidden)
+        occluders = () if shadows is None else (spread_out(types.UInt32, shadows, pair),)
+        dr.eval(*occluders)
+        *fluxes, met = self._integrator.flux(self._sampler, rays.ray, now, rays.filter, *occluders)
         bits = dr.select(met, types.UInt32(1), dr.zeros(types.UInt32, int(packets.sum()) * PACKET))
         dr.eval(fluxes, bits)
         self._sampler.rest()

@@ -80,11 +80,13 @@ class PairTracer(DecisionRays):
             trace = partial(self._trace_block, *given)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report(int(packets[part].sum()) * PACKET)
+        # the mean of the model is known in closed form, and rays had its difference to the scene only
         if edges is not None:
             there = np.flatnonzero(edges.is_there)
             model = edges.part(there).mean
             out.half_a[there] += model
             out.half_b[there] += model
+        # a control variate can bring a mean below 0
         if not signed:
             not_negative(out)
         scale = self.axis_factor(pixel)

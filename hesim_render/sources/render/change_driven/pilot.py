@@ -190,6 +190,8 @@ def take_pilot(
     # known shadows [window, site]: shapes that hide light in the first window do so in those that follow
     shadows, given_shadows = np.zeros((count, sites.size), np.uint32), (rays, width_px, wanted, mild)
     first, shadows[:] = with_known_shadows(tracer, (sites.index, numbers[0], windows), first, *given_shadows)
+    # what no ray sees come near in the whole span is at rest; with a moving camera, or a lens that spreads light, rays
+    # cannot tell
     knows = tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
     near = first.met if knows else np.ones(sites.size, np.bool_)
 
@@ -221,16 +223,19 @@ def take_pilot(
             looks.wherever(windows_with_changes(*of, shadows[0], few_stride))
         else:
             looks.every(stride, sites, wanted)
+    # statistics of all windows, [window, site]
     tables = [looks.tables[name] for name in STATISTICS]
     pilot = Pilot(tables[0], tables[1], tables[2], tables[3], tables[4])
     change = None
     if anchored is not None:
+        # inner windows against the first one, the first and the last against the anchor
         means = [values - values[:1] for values in (pilot.controlled, pilot.plain)]
         for mean, values, other in zip(
             means, (pilot.controlled, pilot.plain), (anchored.flux.controlled, anchored.flux.plain), strict=True
         ):
             mean[[0, -1]] = values[[0, -1]] - other
         change = Change(means[0], means[1], looks.tables[CHANGES[0]], looks.tables[CHANGES[1]])
+    # extra rays where small objects pass, which the few rays of the pilot may miss
     near_by = [(window, one) for window, row in enumerate(extra_looks) for one in row if one.place.size]
     aims = Aims.of([(window, *one.aims) for window, one in near_by if one.aims is not None], sites.size)
     refined = _refine(tracer, sites, windows, numbers, pilot, width_px, near_by, aims, shadows)
@@ -263,6 +268,7 @@ def _refine(
     kinds = sorted({(look.is_small, look.aims is not None, look.rays) for _, look in looks})
     # large objects first: a pixel may show a small object as well, whose result must stay
     for is_small, is_aimed, rays in kinds:
+        # one trace for all windows of a kind: [k] windows and places
         alike = [
             (window, look.place)
             for window, look in looks
@@ -270,6 +276,7 @@ def _refine(
         ]
         place = np.concatenate([places for _, places in alike])
         window = np.concatenate([np.full(places.size, window) for window, places in alike])
+        # aimed rays start in the pixel itself, others in an area as wide as those of the pilot
         own_aims = aims.at(window, place) if is_aimed and aims is not None else None
         width = 1.0 if is_aimed else width_px
         refined = tracer.pilot(
@@ -277,11 +284,13 @@ def _refine(
             aims=own_aims,
             shadows=shadows[window, place],
         )
+        # these rays see better than the pilot; those of small objects that are not aimed only tell of more scatter
         if is_aimed or not is_small:
             for values, new in zip(_tables(pilot), _tables(refined), strict=True):
                 values[window, place] = new
         if not is_small:
             continue
+        # scatter of small objects, sorted by window
         for number in np.unique(window):
             own = window == number
             counts = np.full(np.count_nonzero(own), rays)

@@ -121,11 +121,13 @@ class Moments:
 
 def _bins(windows: Windows) -> tuple[NDArray[np.uint32], tuple[tuple[float, float], ...]]:
     """Group windows that are close in time: a group number for each window, and an interval for each group."""
+    # groups of successive windows, as even in number as possible
     order = np.argsort(windows.begin_us, kind="stable")
     number = np.empty(windows.size, np.uint32)
     number[order] = np.arange(windows.size) * min(windows.size, _MOST_BINS) // windows.size
     count = int(number.max()) + 1
     low, high = np.full(count, np.inf), np.full(count, -np.inf)
+    # the interval of a group goes from its earliest begin to its latest end
     np.minimum.at(low, number, windows.begin_us)
     np.maximum.at(high, number, windows.end_us)
     return number, tuple(zip(low.tolist(), high.tolist(), strict=True))

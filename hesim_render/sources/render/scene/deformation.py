@@ -40,9 +40,11 @@ class Deformation:
 
     def at(self, t_us: ArrayLike) -> NDArray[np.float64]:
         """Positions at times [...], [..., vertex, 3], m."""
+        # time since the first shape, wrapped or held at the ends
         local = np.asarray(t_us, dtype=np.float64) - self.knots_us[0]
         local = np.mod(local, self.period_us) if self.repeat else np.clip(local, 0.0, self.period_us)
         knots = self.knots_us - self.knots_us[0]
+        # the two shapes around each time, between which vertices go along straight lines
         segment = np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2)
         share = ((local - knots[segment]) / (knots[segment + 1] - knots[segment]))[..., None, None]
         begin = self.vertices_m[segment].astype(np.float64)
@@ -86,6 +88,7 @@ def read_deformation(
         before, after = times[wrong[0] : wrong[0] + 2]
         raise SpecError(f"times must increase by 1 µs or more: {after:g} µs follows {before:g} µs",
                         file=spec.path, key=key)  # fmt: skip
+    # to world coordinates, shape by shape: all of them in float64 would need twice the memory
     placed = np.empty(vertices.shape, np.float32)
     for shape, own in zip(placed, vertices, strict=True):
         shape[:] = own.astype(np.float64) @ fit[:3, :3].T + fit[:3, 3]

@@ -30,14 +30,14 @@ def named_spectra(spec: SceneSpec) -> Iterator[tuple[str, Spectrum]]:
     The RGB colours of a Mitsuba scene become spectra over the whole visible range, so there is nothing to check.
     """
     lamp = lamps_of(spec.target)
-    is_lit = any(light.is_lit for light in spec.lights) or any(own.is_lit for own in spec.lamps)
-    if spec.mitsuba is not None or not is_lit:
+    is_on = any(light.is_on for light in spec.lights) or any(own.is_on for own in spec.lamps)
+    if spec.mitsuba is not None or not is_on:
         return
     for number, light in enumerate(spec.lights):
-        if light.is_lit:
+        if light.is_on:
             yield f"{lights.key_of(spec.lights, number)}.illuminant", light.illuminant.load()
     if spec.target is not None:
-        if lamp is not None and lamp.is_lit:
+        if lamp is not None and lamp.is_on:
             yield "target.illuminant", lamp.illuminant.load()
         for piece in target_pieces(spec):
             if not isinstance(piece.reflectance, Picture):
@@ -49,7 +49,7 @@ def named_spectra(spec: SceneSpec) -> Iterator[tuple[str, Spectrum]]:
         own = [("reflectance", item.reflectance), ("pattern", item.pattern)]
         if item.texture is not None or item.material is not None:
             own = [(f"material.{key}", source) for key, source in leaves_of(item.material or {}, SpectrumSpec)]
-        if item.emission is not None and item.emission.is_lit:
+        if item.emission is not None and item.emission.is_on:
             own.append(("emission.illuminant", item.emission.illuminant))
         for key, source in own:
             if source is not None:

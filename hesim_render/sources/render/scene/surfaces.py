@@ -62,7 +62,7 @@ def paint_of(item: ObjectSpec, name: str) -> Paint:
 
 def radiance_of(item: ObjectSpec) -> Spectrum | None:
     """Radiance that an object's surface gives, W m⁻² sr⁻¹ nm⁻¹; None if it gives none."""
-    return item.emission.radiance() if item.emission is not None and item.emission.is_lit else None
+    return item.emission.radiance() if item.emission is not None and item.emission.is_on else None
 
 
 def area_emitter(radiance: Spectrum | None) -> dict[str, Any] | None:

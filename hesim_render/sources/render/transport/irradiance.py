@@ -49,6 +49,7 @@ class RectangleLight:
         to = self.middle - point
         square = dr.squared_norm(to)
         before = -dr.dot(to, self.normal)
+        # a lamp of a small solid angle: Lambert's formula would cancel in float32
         as_point = self._area_m2 * before * dr.dot(to, normal) / (square * square)
         exact = dr.select(self._area_m2 < _SMALL_SR * square, dr.maximum(as_point, 0.0), 0.5 * abs(total))
         return dr.select(before > 0, exact, 0.0)
@@ -113,9 +114,11 @@ def outline_above_horizon(mi: MitsubaModule, rays: Sequence[Vector3], normal: Ve
         following = (k + 1) % len(rays)
         b, height_b = rays[following], heights[following]
         above_a, above_b = height_a >= 0, height_b >= 0
+        # an edge that crosses the horizon is cut there
         on_horizon = dr.fma(b - a, height_a / (height_a - height_b), a)
         first, second = dr.select(above_a, a, on_horizon), dr.select(above_b, b, on_horizon)
         total += dr.select(above_a | above_b, _edge(first, second, normal), 0.0)
+        # a convex polygon leaves and enters once; the edge between both places closes it
         leaving = dr.select(above_a & ~above_b, on_horizon, leaving)
         entering = dr.select(~above_a & above_b, on_horizon, entering)
         crosses |= above_a != above_b

@@ -87,6 +87,7 @@ class Fleet:
         [interval, object + bunch, 8]. In each interval, objects are sorted by their place; the number beside the low
         corner is that of the object in the fleet. Then the boxes around each bunch.
         """
+        # objects that lie near one another come into one bunch, so that few rays meet many bunches
         own = boxes[:, self._numbers]
         order = np.argsort(_along_a_curve(own[..., :3] + own[..., 4:7]), axis=1, kind="stable")
         own = np.take_along_axis(own, order[..., None], axis=1)
@@ -191,6 +192,7 @@ class Fleet:
         mi = self._mi
 
         def bunch(number: UInt32, *state: Any) -> LoopState:
+            # members of a bunch are looked at only by lanes that met its box
             inside = active & meets_box(ray, inverse, length, moment.box(self._end + number))
             first = self._first + number * self._bunch
             end = dr.minimum(first + self._bunch, self._end)
@@ -273,6 +275,7 @@ def _before(t: Float, group: UInt32, other_t: Float, other_group: UInt32) -> Mas
 
 def _along_a_curve(places: NDArray[np.float32]) -> NDArray[np.int64]:
     """Position of places [..., n, 3] along a Z-order curve through their bounding box, [..., n]."""
+    # cell of each place on a cubic grid, whose bits of three axes are interleaved
     low, high = places.min(axis=-2, keepdims=True), places.max(axis=-2, keepdims=True)
     share = (places - low) / np.maximum((high - low).max(axis=-1, keepdims=True), 1e-30)
     cell = (share * ((1 << _PLACE_BITS) - 1)).astype(np.int64)

@@ -32,8 +32,9 @@ def places(
     begin_us, end_us : the interval, µs.
 
     Returns
-    ------- For each piece of the track between keyframes: the corners at its ends and at some instants between, [k, n,
-    3], m; and the largest distance of any point from the straight line between two of these positions, m.
+    -------
+    For each piece of the track between keyframes: the corners at its ends and at some instants between, [k, n, 3], m;
+    and the largest distance of any point from the straight line between two of these positions, m.
     """
     pieces, radius = [], float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
     for piece in trajectory.pieces(begin_us, end_us):
@@ -59,19 +60,23 @@ def places_seen(
     """
     radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
     inner = np.union1d(trajectory.ends_us(begin_us, end_us), camera.ends_us(begin_us, end_us))
+    # between these times both tracks have constant speeds
     cuts, pieces = np.concatenate([[begin_us], inner, [end_us]]), []
     for low, high in pairwise(cuts):
         speed, turn = _speed_and_turn(trajectory, low, high)
         own_speed, own_turn = _speed_and_turn(camera, low, high)
+        # steps of few degrees, so that arcs are short against their radius
         steps = min(_MOST_STEPS, max(1, ceil((turn + own_turn) * (high - low) * S_PER_US / _STEP_RAD)))
         times = np.linspace(low, high, steps + 1)
         (_, poses), (_, views) = trajectory.throughout(times), camera.throughout(times)
         points = corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
         step_s = (high - low) * S_PER_US / steps
+        # bounds of |q̇|, and of |q| between two instants
         fastest = speed + turn * radius + own_speed
         pivots = views[:, :3, :3] @ camera.pivot_m + views[:, :3, 3]
         far = float(np.linalg.norm(points - pivots[:, None], axis=2).max()) + fastest * step_s / 2
         acceleration = own_turn * own_turn * far + 2 * own_turn * fastest + turn * turn * radius
+        # positions as the resting camera would see them, and a h²/8
         pieces.append(((points - views[:, None, :3, 3]) @ views[:, :3, :3], acceleration * step_s * step_s / 8))
     return pieces
 
@@ -81,6 +86,7 @@ def stays_in(
 ) -> NDArray[np.float64]:
     """Axis-parallel boxes [k, 2, 3], m, that contain an object during each of k intervals; see `places`."""
     radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
+    # instants of all intervals in one list, so that the poses are computed in one call
     segments: list[NDArray[np.int64]] = []
     shares: list[NDArray[np.float64]] = []
     margins: list[NDArray[np.float64]] = []
@@ -94,6 +100,7 @@ def stays_in(
             margins.append(np.full(share.size, margin))
     poses = trajectory.within(np.concatenate(segments), np.concatenate(shares))
     points = corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    # arcs leave the chords by their margins at most; then one box over the instants of each interval
     wider = np.concatenate(margins)[:, None]
     first = np.cumsum([0, *(share.size for share in shares)])[starts]
     low = np.minimum.reduceat(points.min(axis=1) - wider, first, axis=0)
@@ -103,6 +110,7 @@ def stays_in(
 
 def _instants(trajectory: Trajectory, piece: Piece, radius_m: float) -> tuple[NDArray[np.float64], float]:
     """Shares of a piece at which an object's position is computed, and a bound of its distance from the chords, m."""
+    # so many steps that none turns further than `_STEP_RAD`; the bound is ρ (1 − cos δ/2)
     turn = abs(float(trajectory.arc_rad[piece.segment])) * (piece.last - piece.first)
     steps = min(_MOST_STEPS, max(1, ceil(turn / _STEP_RAD)))
     return np.linspace(piece.first, piece.last, steps + 1), radius_m * (1 - cos(min(turn / steps / 2, pi)))

@@ -74,7 +74,7 @@ class LampShadows:
         point = shadow.o
         corners, planes, weights, is_clear = lamp.outline(point, normal)
 
-        def add(code: UInt32, hidden: Float, count: Float) -> tuple[UInt32, Float, Float]:
+        def add(code: UInt32, occluded: Float, count: Float) -> tuple[UInt32, Float, Float]:
             shape = self._shape((code & 255) - 1, moment)
             # parts of a shape behind the lamp hide nothing
             counts = is_clear & (shape.over(lamp.middle, lamp.normal) > 0)
@@ -82,11 +82,11 @@ class LampShadows:
             part, is_outside = dr.if_stmt(given, shape.square > 0, by_ball, by_box, label="shadow")
             counts &= is_outside
             hits = counts & shape.meets(shadow)
-            return code >> 8, hidden + dr.select(counts, part, 0), count + dr.select(hits, mi.Float(1.0), 0)
+            return code >> 8, occluded + dr.select(counts, part, 0), count + dr.select(hits, mi.Float(1.0), 0)
 
         state = code, mi.Float(0.0), mi.Float(0.0)
-        _, hidden, count = dr.while_loop(state, lambda code, *_: code != 0, add, label="shadows")
-        return hidden, count
+        _, occluded, count = dr.while_loop(state, lambda code, *_: code != 0, add, label="shadows")
+        return occluded, count
 
     def first_met(self, shadow: Ray, moment: Moment, active: Mask) -> UInt32:
         """Number, from 1, of the first shape in the list that a ray meets before its `maxt`; 0 if it meets none."""

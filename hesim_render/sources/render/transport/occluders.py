@@ -41,6 +41,7 @@ class Occluder:
 
     def over(self, place: Point3, along: Vector3) -> Float:
         """Least height of the shape over a plane through a place, along its unit normal, m."""
+        # the corner that lies lowest along the normal: each side counts where it goes down
         below = type(self.height)(0.0)
         for side, part in zip(self.sides, (1, 1, self.height), strict=True):
             below += dr.minimum(dr.dot(side, along) * part, 0)
@@ -53,6 +54,7 @@ class Occluder:
         across = dr.cross(b, c), dr.cross(c, a), dr.cross(a, b)
         per_volume = dr.rcp(dr.dot(a, across[0]))
         kind = type(self.height)
+        # slabs: the ray is inside from the latest entry to the earliest exit
         enter, leave = kind(-dr.inf), kind(dr.inf)
         for each, far in zip(across, (1, 1, self.height), strict=True):
             row = each * per_volume
@@ -63,6 +65,7 @@ class Occluder:
             rises = per_speed > 0
             first, last = dr.select(rises, one, other), dr.select(rises, other, one)
             enter, leave = dr.select(first > enter, first, enter), dr.select(last < leave, last, leave)
+        # a ray that starts inside meets the shape where it leaves
         t = dr.select(enter >= 0, enter, leave)
         box = (enter <= leave) & (t >= 0) & (t < ray.maxt)
         t = to_ball(ray, self.corner, self.square)
@@ -92,9 +95,10 @@ def by_box(
     per_volume = dr.rcp(volume)
     # place of the point between the faces of each pair
     places = [-dr.dot(each, relative) * per_volume for each in across]
-    hidden, is_outside = kind(0.0), type(volume > 0)(False)
+    occluded, is_outside = kind(0.0), type(volume > 0)(False)
     has_all = top > 0
     for axis in range(3):
+        # a face is seen from its outer side only, so at most one of each pair
         far = top if axis == 2 else kind(1.0)
         below, above = places[axis] < -_IN_PLANE, places[axis] > far + _IN_PLANE
         faces = below | above
@@ -112,8 +116,8 @@ def by_box(
             return _edges_within(own, inward, own_weights, planes) + _edges_within(lamp, planes, weights, inward)
 
         part = dr.if_stmt((base, first, second, sign), faces, face, lambda *_: kind(0.0), label="face")
-        hidden += part
-    return 0.5 * hidden, is_outside
+        occluded += part
+    return 0.5 * occluded, is_outside
 
 
 def _edges_within(
@@ -134,9 +138,11 @@ def _edges_within(
         following = (k + 1) % len(corners)
         begin, end = type(total)(0.0), type(total)(1.0)
         for here, there in zip(heights[k], heights[following], strict=True):
+            # where the edge crosses a plane, as a share of its length
             cut = here * dr.rcp(here - there)
             begin = dr.select((here < 0) & (cut > begin), cut, begin)
             end = dr.select((there < 0) & (cut < end), cut, end)
+        # the angle between the ends of the rest, from the products of corner and side alone
         side = corners[following] - corner
         near = dr.fma(dr.dot(corner, side), begin + end, dr.dot(corner, corner))
         along = dr.fma(dr.dot(side, side), begin * end, near)
@@ -185,9 +191,11 @@ def by_ball(
         at = dr.atan2(dr.dot(middle, ahead), dr.dot(middle, foot))
         reach = dr.acos(dr.minimum(cosine / low, 1))
         begin, end = at - half, at + half
+        # the part of the edge within the circle, which the ball hides
         enter, leave = dr.clip(-reach, begin, end), dr.clip(reach, begin, end)
         total += (leave - enter) * weights[k]
         ahead_n, beside_n = dr.dot(ahead, normal), dr.dot(beside, normal)
+        # in place of its two parts outside, the arcs of the circle in their sectors
         for one, other in ((begin, enter), (leave, end)):
             (s_1, c_1), (s_2, c_2) = dr.sincos(one), dr.sincos(other)
             turn = dr.atan2(height * dr.sin(other - one), s_1 * s_2 + height * height * c_1 * c_2)

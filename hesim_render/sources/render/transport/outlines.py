@@ -184,7 +184,7 @@ class Screen:
             for corner in corners:
                 rises |= dr.dot(corner - point, normal) > 0
 
-            def hidden(
+            def occluded(
                 point: Point3, normal: Vector3, direction: Vector3, height: Float, corners: list[Point3] = corners
             ) -> tuple[Float, Float]:
                 rays = [corner - point for corner in corners]
@@ -199,7 +199,7 @@ class Screen:
             part, hides = dr.if_stmt(
                 (point, normal, direction, height),
                 counts & rises,
-                hidden,
+                occluded,
                 lambda *_: (mi.Float(0.0), mi.Float(0.0)),
                 label="outline",
             )
