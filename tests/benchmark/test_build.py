@@ -309,7 +309,7 @@ def test_a_wrong_clip_does_not_stop_the_others_but_a_fatal_one_does(monkeypatch)
     workers = LocalWorkers("{}", 2)
     with pytest.raises(OutputError, match="is wrong"):
         workers.run(clips, lambda answer: None)
-    assert workers.pids == []
+    assert workers._workers == []
 
 
 def test_workers_that_cannot_start_are_one_error(monkeypatch):

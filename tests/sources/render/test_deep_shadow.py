@@ -144,7 +144,7 @@ def test_pixels_that_lie_apart_are_looked_at_in_a_block(monkeypatch, apart, wind
     monkeypatch.setattr(adaptive, "deep_shadow", looks)
     own = SimpleNamespace(
         tracer=tracer, tuning=TUNING, counts=SimpleNamespace(pilot_rays=70), _footprint_px=lambda band: 1.75,
-        zoom=SimpleNamespace(sites=lambda *_: ()),
+        zoom=SimpleNamespace(sites=lambda *_: ()), has_ticks=False,
         _sensor=SimpleNamespace(spec=SimpleNamespace(geometry=SimpleNamespace(cols=20))),
     )  # fmt: skip
     band = SimpleNamespace(
