@@ -12,6 +12,7 @@ from scipy.stats import norm
 from hesim_render.calibrate.recordings import rests, target
 from hesim_render.calibrate.recordings.tally import GROUPS, STEPS, tally
 from hesim_render.exchange import EventStream
+from hesim_render.pixels.evs.events import EVENT_DTYPE
 from tests.support.still_pixels import noisy_target_events
 
 SIDE = 20
@@ -114,7 +115,7 @@ def test_pixels_beside_those_that_see_less_do_not_count():
     count = np.rint(np.array([310, 240])[:, None] * part.ravel() * (1 + 0.08 * rng.standard_normal((2, part.size))))
     one = SimpleNamespace(
         shape=shape, used=np.ones(part.size, bool), per_pixel=lambda: count, same=np.zeros((2, 2, GROUPS, STEPS)),
-        gap_us=np.full((2, part.size), 9e6), turns=np.full((2, part.size), 30),
+        gap_us=np.full((2, part.size), 3e5),
     )  # fmt: skip
     kept = target.seen_alike(one).reshape(shape)
     assert kept[10:14].mean() < 0.1 and kept[:9].mean() > 0.9 and kept[15:].mean() > 0.9
@@ -123,12 +124,60 @@ def test_pixels_beside_those_that_see_less_do_not_count():
 def test_late_events_count_where_the_rest_of_nearly_all_pixels_has_begun():
     """Rests of 0.2 s and more, those of a twentieth of the pixels end 31 ms earlier; others are not looked at."""
     gap_us = np.tile(np.linspace(0.2e6, 0.2e6 + 40, 81), 5) + np.repeat([-4000.0, 0, 0, 0, 9000.0], 81)
-    one = SimpleNamespace(only=np.arange(405) >= 0, gap_us=np.array([3 * gap_us, gap_us]), turns=np.full((2, 405), 3))
+    one = SimpleNamespace(only=np.arange(405) >= 0, gap_us=np.array([gap_us, gap_us / 3]))
     assert rests._later_s(one, 0) == pytest.approx(4.0e-3 + 10e-6, abs=6e-6)
     one.only = np.repeat([False, True, True, True, False], 81)
     assert rests._later_s(one, 0) == pytest.approx(18e-6, abs=1e-6) and rests._later_s(one, 1) < 7e-6
     one.only = None
     assert rests._later_s(one, 0) == 0
+
+
+def test_late_events_leave_the_longest_gap_of_a_pixel_as_it_is():
+    """Two pixels, times by hand; the second one has a late ON event in one of three cycles. Blocks cut a gap in two."""
+    times = {0: ([10, 20, 330, 340], [110, 120, 430, 440]), 1: ([11, 21, 95, 331, 341], [112, 122, 431, 441])}
+    rows = sorted((t, x, p) for x, both in times.items() for p, one in zip((1, -1), both, strict=True) for t in one)
+    events = np.zeros(len(rows), EVENT_DTYPE)
+    events["t_us"], events["x"], events["polarity"] = 1000 * np.array([row[0] for row in rows]), *np.array(rows).T[1:]
+    for cut in (4, 9):
+        blocks = np.split(events, [cut])
+        one = tally(EventStream(lambda blocks=blocks: iter(blocks), (1, 2)))
+        assert one.gap_us.tolist() == [[90_000, 90_000], [210_000, 209_000]]
+
+
+def test_pixels_whose_light_rests_longer_than_that_of_others_do_not_count():
+    """15 % from the median, and twice the usual interval at least."""
+    count = np.full((2, 100), 90.0)
+    gap_us = np.full((2, 100), 200_000)
+    gap_us[0, :3], gap_us[1, 3:6] = (169_000, 171_000, 231_000), (171_000, 229_000, 231_000)
+    for interval_us, kept in ((5000, [1, 3, 4]), (14_950, [1, 3, 4]), (15_900, [0, 1, 2, 3, 4, 5])):
+        same = np.array([[histogram((us, 90))] * GROUPS for us in (interval_us, 0.6 * interval_us)])
+        one = SimpleNamespace(
+            shape=(10, 10), used=np.ones(100, bool), per_pixel=lambda: count, same=same, gap_us=gap_us
+        )
+        assert np.flatnonzero(target.seen_alike(one)[:6]).tolist() == kept
+        assert target.seen_alike(one)[6:].all()
+
+
+def test_simulated_pixels_are_left_out_as_those_of_a_recording_are(monkeypatch):
+    """By whole counts of all cycles, of which one is the least difference that matters."""
+    none = np.zeros(target._PIXELS)
+    simulated = target._Simulated(2.0, 10, target._Course(none, none, (0.0, 0.0), 0.0, np.zeros((2, 2))))
+    given = []
+
+    def every_third(count, seen):
+        given.append(count)
+        return seen & (np.arange(seen.size) % 3 == 1)
+
+    monkeypatch.setattr(target, "_regular", every_third)
+    values = np.array([0.18, 0.234, 0.03**2])
+    (mean_on, mean_off, variance), _ = simulated.moments(values), simulated.moment_covariance(values)
+    for count in given:
+        # the swing of a reference is short of the light's by half of each threshold
+        assert np.array_equal(count, np.rint(count)) and count[0].mean() == pytest.approx(10 * 1.793 / 0.18, rel=3e-3)
+        own = count[:, 1::3] / 10
+        assert (mean_on, mean_off) == pytest.approx(own.mean(axis=1))
+        assert variance == pytest.approx(np.mean(own.var(axis=1, ddof=1) / own.mean(axis=1) ** 2))
+    assert len(given) == 2
 
 
 def star(rng, shape):

@@ -220,7 +220,7 @@ def _later_s(tally: EventTally, polarity: int) -> float:
     """By how much the rest of pixels begins later than that of most: what comes until then may be of the ramp, s."""
     if tally.only is None:
         return 0.0
-    own_us = (tally.gap_us[polarity] / np.maximum(tally.turns[polarity], 1))[tally.only]
+    own_us = tally.gap_us[polarity][tally.only]
     return float(np.median(own_us) - np.quantile(own_us, _LATEST)) * S_PER_US
 
 
