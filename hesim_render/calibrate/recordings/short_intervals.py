@@ -25,9 +25,9 @@ _UNEVEN = 0.02
 #: A density whose logarithm falls by more than this within the counts after the edge is not known there; chance of a
 #: count that is too large for the density.
 _FALLS, _CHANCE = 0.25, 1e-4
-#: Where pixels start anew after the dead time, noise comes to a threshold late: at most so many times of its rise from 10
-#: to 90 % lie between both (0.7 to 3.7 in noise of 60 to 1500 Hz written in NumPy, θ/σ of 0.7 to 3.5; 2.1 of simulated
-#: `dvxplorer` at 3 lx; chosen on these, judged on those of the test).
+#: Where pixels start anew after the dead time, noise comes to a threshold late: at most so many times of its rise from
+#: 10 to 90 % lie between both (0.7 to 3.7 in noise of 60 to 1500 Hz written in NumPy, θ/σ of 0.7 to 3.5; 2.1 of
+#: simulated `dvxplorer` at 3 lx; chosen on these, judged on those of the test).
 _SLOW = 5.0
 #: Steps from 0 to the edge, over the counts that are read about it, from which these bound a step whose density falls.
 _FEW_STEPS = 8
