@@ -31,7 +31,8 @@ _LEAST_CYCLES, _LEAST_EVENTS = 3, 1.5
 #: Relative error of the variance of the thresholds, by pixels that see nearly the whole contrast.
 _PARTIAL = 0.06
 #: Relative difference of the rests of pixels that are taken together; most deviations of a pixel's counts, of those
-#: above the median, and the times that pixels beyond are taken out.
+#: above the median, and the times that pixels beyond are taken out. Chosen on stars and checkerboards written in NumPy,
+#: judged on those of the tests, on their six sensors and on a hundred more, which have seeds of their own.
 _SAME_REST, _FAR, _CUTS = 0.15, 3.0, 6
 
 
