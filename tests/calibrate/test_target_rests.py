@@ -158,6 +158,20 @@ def test_pixels_whose_light_rests_longer_than_that_of_others_do_not_count():
         assert target.seen_alike(one)[6:].all()
 
 
+def test_the_leak_is_taken_off_the_on_events_that_tell_the_ratio(monkeypatch):
+    """90 and 60 events in 2 s, a leak of 3 Hz; a cycle takes 0.4 s."""
+    count = np.repeat([[90.0], [60.0]], 100, axis=1)
+    one = SimpleNamespace(
+        shape=(10, 10), used=np.ones(100, bool), per_pixel=lambda: count, same=np.zeros((2, 2, GROUPS, STEPS)),
+        gap_us=np.full((2, 100), 9000), seconds=2.0,
+    )  # fmt: skip
+    given = []
+    monkeypatch.setattr(target, "_course", lambda *of: given.extend(of[1:]) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        target.thresholds(one, 8.0, 2.5, 3.0)
+    assert given == pytest.approx([3.0, 0.4, 1.4])
+
+
 def test_simulated_pixels_are_left_out_as_those_of_a_recording_are(monkeypatch):
     """By whole counts of all cycles, of which one is the least difference that matters."""
     none = np.zeros(target._PIXELS)
