@@ -172,6 +172,29 @@ def test_the_leak_is_taken_off_the_on_events_that_tell_the_ratio(monkeypatch):
     assert given == pytest.approx([3.0, 0.4, 1.4])
 
 
+def test_what_is_not_known_of_the_overshoots_is_a_part_of_the_swing_of_the_level(monkeypatch):
+    """The light's ln 8 and overshoots of 0.4 θ₊ and 0.6 θ₋ on average; ends of (0.1, 0.2) down and (0.3, 0.4) up."""
+    size = 100
+    count = np.repeat([[90.0], [60.0]], size, axis=1)
+    one = SimpleNamespace(
+        shape=(10, 10), used=np.ones(size, bool), per_pixel=lambda: count, same=np.zeros((2, 2, GROUPS, STEPS)),
+        gap_us=np.full((2, size), 9000), seconds=2.0, group=np.arange(size) % GROUPS,
+    )  # fmt: skip
+    course = target._Course(
+        np.array([0.3, 0.5]), np.array([0.5, 0.7]), (0.0, 0.0), 0.0, np.array([[0.1, 0.2], [0.3, 0.4]])
+    )
+    fitted = np.array([0.2, 0.25, 0.01])
+    monkeypatch.setattr(target, "_course", lambda *_: course)
+    monkeypatch.setattr(target, "_Simulated", lambda *_: SimpleNamespace(
+        fit=lambda _: (fitted, np.eye(3)), moment_covariance=lambda _: np.zeros((3, 3))
+    ))  # fmt: skip
+    found = target.thresholds(one, 8.0, 2.5, 0.0).entries
+    swing = np.log(8) + 0.4 * 0.2 + 0.6 * 0.25
+    for name, value in (("theta_on", 0.2), ("theta_off", 0.25)):
+        down, up = value * 0.07 / swing, value * 0.16 / swing
+        assert found[name]["interval_95"] == pytest.approx([value - down, value + up], rel=1e-9)
+
+
 def test_simulated_pixels_are_left_out_as_those_of_a_recording_are(monkeypatch):
     """By whole counts of all cycles, of which one is the least difference that matters."""
     none = np.zeros(target._PIXELS)
