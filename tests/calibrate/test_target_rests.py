@@ -121,6 +121,18 @@ def test_pixels_beside_those_that_see_less_do_not_count():
     assert kept[10:14].mean() < 0.1 and kept[:9].mean() > 0.9 and kept[15:].mean() > 0.9
 
 
+def test_means_of_nine_pixels_may_be_a_third_of_an_event_away():
+    """Twelve events of each pixel of each polarity, eleven in four rows: one pixel may have so many, not nine."""
+    count = np.full((2, 24, 30), 12.0)
+    count[:, 10:14] = 11
+    one = SimpleNamespace(
+        shape=(24, 30), used=np.ones(720, bool), per_pixel=lambda: count.reshape(2, -1),
+        same=np.zeros((2, 2, GROUPS, STEPS)), gap_us=np.full((2, 720), 3e5),
+    )  # fmt: skip
+    kept = target.seen_alike(one).reshape(24, 30)
+    assert not kept[10:14].any() and kept[:9].all() and kept[15:].all()
+
+
 def test_late_events_count_where_the_rest_of_nearly_all_pixels_has_begun():
     """Rests of 0.2 s and more, those of a twentieth of the pixels end 31 ms earlier; others are not looked at."""
     gap_us = np.tile(np.linspace(0.2e6, 0.2e6 + 40, 81), 5) + np.repeat([-4000.0, 0, 0, 0, 9000.0], 81)
@@ -185,14 +197,26 @@ def test_what_is_not_known_of_the_overshoots_is_a_part_of_the_swing_of_the_level
     )
     fitted = np.array([0.2, 0.25, 0.01])
     monkeypatch.setattr(target, "_course", lambda *_: course)
+    wanted = []
     monkeypatch.setattr(target, "_Simulated", lambda *_: SimpleNamespace(
-        fit=lambda _: (fitted, np.eye(3)), moment_covariance=lambda _: np.zeros((3, 3))
+        fit=lambda of: wanted.extend(of) or (fitted, np.eye(3)), moment_covariance=lambda _: np.zeros((3, 3))
     ))  # fmt: skip
     found = target.thresholds(one, 8.0, 2.5, 0.0).entries
+    assert wanted == pytest.approx([18.0, 12.0, 0.0])  # of five cycles
     swing = np.log(8) + 0.4 * 0.2 + 0.6 * 0.25
     for name, value in (("theta_on", 0.2), ("theta_off", 0.25)):
         down, up = value * 0.07 / swing, value * 0.16 / swing
         assert found[name]["interval_95"] == pytest.approx([value - down, value + up], rel=1e-9)
+
+
+def test_simulated_counts_are_those_of_the_swing_the_overshoots_and_the_drift():
+    """A reference is half of a threshold short of the level at either end, on average over its places."""
+    over = np.full(target._PIXELS, 0.4), np.full(target._PIXELS, 0.7)
+    simulated = target._Simulated(2.0, 20, target._Course(*over, (0.3, 0.5), 0.0, np.zeros((2, 2))))
+    mean_on, mean_off, _ = simulated.moments(np.array([0.18, 0.234, 0.05**2]))
+    swing = 2.0 + (0.4 - 0.5) * 0.18 + (0.7 - 0.5) * 0.234
+    assert mean_on * 0.18 == pytest.approx(swing + 0.5 * 0.18, rel=6e-3)
+    assert mean_off * 0.234 == pytest.approx(swing - 0.3 * 0.18, rel=6e-3)
 
 
 def test_simulated_pixels_are_left_out_as_those_of_a_recording_are(monkeypatch):
