@@ -479,10 +479,10 @@ def histogram(*counts):
     return result
 
 
-def tally_of(late, uneven=0.0):
+def tally_of(late, uneven=0.0, last_us=70_000):
     """Intervals of some 5 and 4 ms, and gaps of some 230 ms of all groups; `late` events in each factor of two."""
     share = 1 + uneven * np.linspace(-1, 1, GROUPS)
-    times = (174_000, 138_000, 70_000)  # before the first event of the fall, which comes 4 ms after the rest
+    times = (174_000, 138_000, last_us)  # before the first event of the fall, which comes 4 ms after the rest
     gaps = np.array([histogram((230_000, 4000), *zip(times, part * np.array(late), strict=True)) for part in share])
     same = [[histogram((us, 90))] * GROUPS for us in (5000, 4000)]
     return SimpleNamespace(only=None, gaps=np.array([gaps, gaps]), same=np.array(same), period_s=lambda: 0.7)
@@ -517,6 +517,13 @@ def test_late_events_of_ramps_that_end_later_do_not_count(first, kept):
     for rest in rests.rests(tally_of((first, 30, 28)), 0.0, 1.25):
         assert rest.late == pytest.approx(GROUPS * np.array([first, 30, 28])[-kept:])
         assert rest.edges_s[0] == pytest.approx(rest.ramps.rest_s / 2**kept, rel=0.09) and rest.edges_s.size == kept + 1
+
+
+def test_a_late_event_is_a_threshold_before_the_fall_is_seen():
+    """111 ms before the first event of the fall are in the last half of 219 ms: it comes 4 or 5 ms after the rest."""
+    for rest in rests.rests(tally_of((20, 30, 28), last_us=111_000), 0.0, 1.25):
+        assert rest.ramps.rest_s == pytest.approx(0.219, abs=3e-3)
+        assert rest.late == pytest.approx(GROUPS * np.array([20, 30, 28]))
 
 
 @pytest.mark.slow
