@@ -140,8 +140,9 @@ def dataset_of(file: Any, name: str, path: Path, kinds: str = "ui", also: Collec
     parts = name.split("/")
     for k in range(len(parts)):
         part = "/".join(parts[: k + 1])
-        if not isinstance(file.get(part, getlink=True), h5py.HardLink):
-            raise SpecError(f"{part} is a link to elsewhere", file=path)
+        link = file.get(part, getlink=True)
+        if not isinstance(link, h5py.HardLink):
+            raise SpecError(f"has no data set {name}" if link is None else f"{part} is a link to elsewhere", file=path)
     data = file[name]
     if not isinstance(data, h5py.Dataset) or data.dtype.kind not in kinds:
         raise SpecError(f"{name} is no data set of {_KINDS.get(kinds, 'numbers')}", file=path)

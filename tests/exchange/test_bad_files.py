@@ -41,6 +41,13 @@ def test_a_file_cut_anywhere_is_one_error_or_fewer_events(name, tmp_path):
             assert name in ("evt2", "evt3", "dat") and found < 3000
 
 
+def test_an_hdf5_file_of_something_else_names_what_it_lacks(tmp_path):
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["cd/time"] = np.arange(3)
+    with pytest.raises(SpecError, match=r"other\.h5: has no data set events/\w"):
+        read_all(tmp_path / "other.h5", "dsec", (4, 5))
+
+
 @pytest.mark.parametrize("name", READABLE)
 def test_damaged_bytes_never_raise_another_error(name, tmp_path):
     path = written(many(500, 1 << 20), name, tmp_path)

@@ -356,16 +356,17 @@ def test_a_report_of_a_simulated_sensor(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_dark_noise_that_rounding_hides_has_a_reason(tmp_path):
-    """The dark noise of `reference-mono` is below what rounding shows; all else has its report."""
+def test_a_dark_noise_that_rounding_hides_is_read_from_grey_values(tmp_path):
+    """The dark noise of `reference-mono`, 0.4 DN, is below what the variance shows; all else has its report."""
     from hesim_render.sensor.sensor import load_sensor
 
     found = make_report(["reference-mono"], tmp_path / "report", size=(12, 16))
     assert found.frames is not None and found.events is not None
     assert any("rounding hides the dark noise" in one for one in found.frames.findings)
-    assert "rounding hides it" in found.frames.entries["temporal_dark_noise_e"]["reason"]
-    gain = load_sensor("reference-mono").spec.aps.system_gain_dn_per_e
-    assert found.frames.entries["K"]["value"] == pytest.approx(gain, rel=0.1)
+    camera = load_sensor("reference-mono").spec.aps
+    dark = found.frames.entries["temporal_dark_noise_e"]
+    assert "grey values" in dark["note"] and dark["interval_95"][0] < camera.read_noise_e < dark["interval_95"][1]
+    assert found.frames.entries["K"]["value"] == pytest.approx(camera.system_gain_dn_per_e, rel=0.1)
     threshold = entry_of(found.events, "threshold", "ON").value
     assert abs(threshold["value"] - 0.1) < 0.005  # contrast_threshold_on of its file
     band = entry_of(found.events, "bandwidth", "ON").value

@@ -58,6 +58,33 @@ def still_events(rng, theta_on, theta_off, sigma, drift, *, cutoff_hz, seconds, 
     return _events(found, shape[1])
 
 
+def reset_events(rng, theta, *, cutoff_hz, dead_us, seconds, shape, nodes=24):
+    """Events of pixels in still light that start anew after their dead time; thresholds in units of their noise.
+
+    A pixel compares with the level that it had at the end of its dead time, so that noise comes to a threshold late.
+    """
+    pole = 2 * np.pi * cutoff_hz / np.sqrt(np.sqrt(2) - 1)
+    dt, dead_s, size = 1 / (nodes * cutoff_hz), 1e-6 * dead_us, shape[0] * shape[1]
+    h = pole * dt
+    move = np.exp(-h) * np.array([[1 + h, h], [-h, 1 - h]])
+    fresh = np.linalg.cholesky(np.eye(2) - move @ move.T)
+    state = rng.standard_normal((2, size))
+    reference, free_s, found = state[0].copy(), np.zeros(size), []
+    for k in range(1, round(seconds / dt)):
+        before, state = state[0], move @ state + fresh @ rng.standard_normal(state.shape)
+        from_s, to_s = (k - 1) * dt, k * dt
+        begins = (free_s > from_s) & (free_s <= to_s)
+        place = np.where(begins, (free_s - from_s) / dt, 0.0)
+        reference = np.where(begins, before + place * (state[0] - before), reference)
+        some = np.flatnonzero((np.abs(state[0] - reference) >= theta) & (free_s <= to_s))
+        sign = np.sign(state[0] - reference)[some].astype(int)
+        goal = reference[some] + sign * theta
+        part = np.clip((goal - before[some]) / (state[0] - before)[some], place[some], 1)
+        free_s[some] = from_s + part * dt + dead_s
+        found.append((np.ceil((from_s + part * dt) * 1e6).astype(int), some, sign))
+    return _events(found, shape[1])
+
+
 def target_events(rng, theta_on, theta_off, rise, *, hz, cycles, shape, sigma=0.0, drift=0.0):
     """Events of pixels that see the light rise and fall by `rise` (ln) `hz` times a second, each with its own phase."""
     steps, size = 1000, theta_on.size

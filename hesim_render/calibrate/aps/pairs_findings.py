@@ -186,7 +186,8 @@ def _of_the_set(result: PairCalibration) -> list[tuple[str, str]]:
     if result.dark_noise_is_rounded_off:
         text = (
             f"the dark variance is down to {result.dark.least_variance:.3f} DN², below the 0.24 of EMVA 1288: rounding "
-            "hides the dark noise, which has an upper limit alone. Capture with more bits or a higher gain"
+            "hides the dark noise. It is read from the probabilities of grey values, or has an upper limit alone: "
+            "capture with more bits or a higher gain"
         )
         outcome.append(("dark noise", text))
     if pairs.is_dark_once:

@@ -49,7 +49,7 @@ class EventTally:
     same, gaps : [first polarity, group of pixels, step], intervals between successive events of a pixel of the same
         polarity, and of different ones, in logarithmic steps.
     turns_us : first times between successive turns of a pixel from OFF to ON events, at most `TURNS`.
-    gap_us, turns : [first polarity, pixel], sums and numbers of the intervals between events of different polarity.
+    gap_us : [first polarity, pixel], longest of the intervals between events of different polarity.
     """
 
     source: str
@@ -68,8 +68,7 @@ class EventTally:
     same: NDArray[np.int64] = field(init=False)
     gaps: NDArray[np.int64] = field(init=False)
     turns_us: list[NDArray[np.int64]] = field(init=False)
-    gap_us: NDArray[np.float64] = field(init=False)
-    turns: NDArray[np.int64] = field(init=False)
+    gap_us: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
         pixels = self.pixels
@@ -78,7 +77,7 @@ class EventTally:
         self.variation, self.pairs = np.zeros(pixels), np.zeros(pixels, np.int64)
         self.waves, self.used = np.zeros((len(LAMPS_HZ), SLICES), np.complex128), np.ones(pixels, np.bool_)
         self.same, self.gaps = np.zeros((2, 2, GROUPS, STEPS), np.int64)
-        self.gap_us, self.turns = np.zeros((2, pixels)), np.zeros((2, pixels), np.int64)
+        self.gap_us = np.zeros((2, pixels), np.int64)
         self.turns_us, self._turns, self._turn_us = [], 0, np.full(pixels, -1, np.int64)
         # group of each pixel: neighbours and columns are spread over all groups
         self.group = (np.arange(pixels, dtype=np.uint64) * np.uint64(2654435761) >> np.uint64(16)) % np.uint64(GROUPS)
@@ -115,8 +114,7 @@ class EventTally:
         self.intervals += np.bincount(np.minimum((t_us - before_us)[known], LONG_US), minlength=LONG_US + 1)
         was_on = np.where(first, self._last_on[pixel], np.append(False, on[:-1]))
         for k, is_turn in enumerate((known & was_on & ~on, known & ~was_on & on)):
-            self.gap_us[k] += np.bincount(pixel[is_turn], (t_us - before_us)[is_turn], self.pixels)
-            self.turns[k] += np.bincount(pixel[is_turn], minlength=self.pixels)
+            np.maximum.at(self.gap_us[k], pixel[is_turn], (t_us - before_us)[is_turn])
         if self.only is not None:
             known = known & self.only[pixel]
         self._successions(known, was_on, on, pixel, t_us - before_us)
