@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rendering import make_scene
 from test_change_driven import ball_before_a_wall, fluxes
 from test_differences import shadow_scene
 
@@ -420,6 +421,24 @@ def test_rays_of_constant_pixels_count_as_those_of_pilots():
     band = SimpleNamespace(sites=SimpleNamespace(size=5, index=np.arange(5)), pilot_rays=8, mild=True)
     AdaptiveRenderer.pilot_rays(own, band, SimpleNamespace(span_us=(0.0, 10.0)), (3.0, 9.0))
     assert own.counts.pilot_rays == 68
+
+
+@pytest.mark.parametrize(("px_per_s", "stride"), [(130, 4), (310, 2), (640, 1)])
+def test_how_often_few_rays_look_follows_the_motion(monkeypatch, px_per_s, stride):
+    """A card that slides in parallel to the picture, with ticks of 1 ms and blocks of 16 of them."""
+    card = {"name": "card", "shape": "rectangle", "size_m": [0.07, 0.04, 0], "position_m": [0.01, 0, 0]}
+    sensor, asked = hr.load_sensor("reference-mono").crop(24, 16), []
+    m_per_s = px_per_s * sensor.spec.geometry.pitch_um * 1e-6 * 0.6 / 0.016  # 0.6 m away, 16 mm
+    keys = [{"t_us": 0}, {"t_us": 400_000, "translation_m": [0.4 * m_per_s, 0, 0]}]
+    camera = {"origin_m": [0, 0, 0.6], "target_m": [0, 0, 0], "focal_length_mm": 16}
+    scene = make_scene(
+        objects=[card], light={"type": "uniform", "illuminance_lux": 700}, camera=camera,
+        motion=[{"object": "card", "keyframes": keys}],
+    )  # fmt: skip
+    own = pilots.windows_with_changes
+    monkeypatch.setattr(pilots, "windows_with_changes", lambda *given: asked.append(given[-1]) or own(*given))
+    fluxes(ChangeDrivenFlux(scene, sensor, seed=4), 0, 16_000)
+    assert asked == [stride]
 
 
 def test_few_constant_pixels_go_on_with_the_pilot_of_all(monkeypatch):
