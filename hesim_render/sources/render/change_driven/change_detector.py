@@ -60,7 +60,7 @@ def _turns(sites: Sites, place: NDArray[np.int64], count: int, stride: int) -> I
             yield turn
         return
     # the fields of a chequered board; which of them is the sequence of Thue and Morse, with which no motion keeps pace
-    which = np.array([(window // stride).bit_count() % 2 for window in range(count)], np.bool_)
+    which = np.array([window.bit_count() % 2 for window in range(count)], np.bool_)
     turn = which[:, None] ^ sites.board.odd[place]
     turn[np.arange(count) % stride > 0] = False
     # what comes between the last look of few rays and that of all would go unseen
