@@ -793,6 +793,13 @@ def test_a_sliding_camera_is_followed_by_half_of_the_least_distance_at_three_tim
     px_per_m = clock._px_per_rad
     assert clock.motion_px(2.5 * span_us, 2.75 * span_us) == pytest.approx(0.25e-6 * span_us * fastest * px_per_m)
     assert clock.motion_px(1.75 * span_us, 2.25 * span_us) == pytest.approx(0.5e-6 * span_us * fastest * px_per_m)
+    # where the camera comes nearer to an object, the later bound is the larger one as well
+    ahead = [{"t_us": 0}, {"t_us": 500_000, "translation_m": (-0.5 * pose[:3, 2]).tolist()}]
+    nearer = Trajectory(TrackSpec.model_validate({"object": "camera", "keyframes": ahead}))
+    closer = MotionClock(view, nearer, clock._groups, lambda t: 40.0)
+    (early,), (late,) = closer._per_metre(1)[1], closer._per_metre(2)[1]
+    assert late > 1.003 * early
+    assert closer.motion_px(1.75 * span_us, 2.25 * span_us) == pytest.approx(0.5e-6 * span_us * late * px_per_m)
     # windows within which nothing moves by more than a pixel: of 0.12 to 0.51 pixels each
     for each_px, windows in ((0.12, 4), (0.24, 4), (0.26, 2), (0.49, 2), (0.51, 1)):
         long_us = 0.25 * span_us, 9.5 * span_us
