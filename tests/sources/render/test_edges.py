@@ -312,12 +312,12 @@ def test_pairs_of_low_contrast_take_the_rays_of_their_own_scatter():
 
 def test_the_scatter_of_two_levels_is_that_of_the_share_of_rays_on_either_side():
     """Of 64 rays 1 or 32 see another level: 3 and 34 of 68 scatter by 0.205 and 0.5 of the contrast. A scatter of 71.3
-    wanted errors takes 256 rays, (0.68·71.3)^(1/0.7), and one of 43.4 takes 126.
+    wanted errors takes 256 rays, (0.68·71.3)^(1/0.7).
     """
     contrast, fewer = np.array([345.5, 349.0, 142.0, 143.5]), np.array([1, 1, 32, 32])
     fit = EdgeFit(*(np.asarray(v, np.float32) for v in (
-        np.ones(4), np.zeros(4), np.zeros(4), np.zeros(4), np.full(4, -0.4), np.full(4, 90.0), 90 + contrast, np.zeros(4),
-        fewer, np.full(4, 64.0),
+        np.ones(4), np.zeros(4), np.zeros(4), np.zeros(4), np.full(4, -0.4), np.full(4, 90.0), 90 + contrast,
+        np.zeros(4), fewer, np.full(4, 64.0),
     )))  # fmt: skip
     tracer = SimpleNamespace(
         edges=lambda pixel, *_: fit.at(pixel), axis_factor=lambda pixel: np.ones(pixel.size, np.float32),
