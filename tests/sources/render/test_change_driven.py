@@ -161,8 +161,10 @@ def long_traces(scene, sensor, begin_us, end_us, rays=4096, seeds=(901, 902)):
 def test_quality_is_reached_and_the_error_that_is_told_is_the_error(name):
     """Against long traces; the mean square over 3072 pixels of a skewed distribution, three runs: false alarm 1e-3."""
     scene, sensor = hr.load_scene(name), noisy()
-    truth, _ = long_traces(scene, sensor, 100_000.0, 101_000.0)  # 8192 rays
-    pixels = np.arange(64 * 48, dtype=np.uint32)
+    # penumbrae of the sweep's lamp are known in closed form to the run and not to the traces, so these take more rays
+    seeds = range(901, 903 if name == "rotating-star" else 909)
+    truth, own = long_traces(scene, sensor, 100_000.0, 101_000.0, seeds=tuple(seeds))
+    pixels, rng = np.arange(64 * 48, dtype=np.uint32), np.random.default_rng(5)
     rays = []
     for quality in (2.0, 1.0, 0.5):
         off, told = [], []
@@ -171,7 +173,8 @@ def test_quality_is_reached_and_the_error_that_is_told_is_the_error(name):
             a, b = (np.array(half, np.float64) for half in source.mean_flux(pixels, 100_000.0, 101_000.0))
             unit = source.noise_unit(pixels, truth, True)
             off.append(((a + b) / 2 - truth) / unit)
-            told.append((a - b) / 2 / unit)
+            # the error of the truth is on both sides
+            told.append(((a - b) / 2 + rng.normal(0, own)) / unit)
         rays.append(source.rays_traced)
         rms, stated = (float(np.sqrt(np.mean(np.square(values)))) for values in (off, told))
         # light that is known in closed form has hardly any noise, so that the least numbers of rays may do better
