@@ -437,8 +437,14 @@ def test_how_often_few_rays_look_follows_the_motion(monkeypatch, px_per_s, strid
     )  # fmt: skip
     own = pilots.windows_with_changes
     monkeypatch.setattr(pilots, "windows_with_changes", lambda *given: asked.append(given[-1]) or own(*given))
-    fluxes(ChangeDrivenFlux(scene, sensor, seed=4), 0, 16_000)
-    assert asked == [stride]
+    source, bounds = ChangeDrivenFlux(scene, sensor, seed=4), []
+    bound = source._clock.windows_of_a_pixel
+    source._clock.windows_of_a_pixel = lambda *given: bounds.append(given[-1]) or bound(*given)
+    # a frame is no block of ticks
+    source.mean_flux(np.arange(24 * 16, dtype=np.uint32), 0, 2000.0)
+    assert not bounds
+    fluxes(source, 0, 16_000)
+    assert asked == [stride] and bounds == [16]
 
 
 def test_few_constant_pixels_go_on_with_the_pilot_of_all(monkeypatch):

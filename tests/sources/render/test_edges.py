@@ -290,22 +290,28 @@ def test_rays_follow_from_what_the_decision_rays_saw():
     assert about_edges(moving, (pixel, 0 * pixel, None), *given)[0].tolist() == [64, 512, 256, 32, 128, 512, 256, 128]
 
 
+def without_lines(contrast, scatter, fewer, law, moves):
+    """Rays and edges of pairs that no line parts, by fits of 64 rays as given, all in wanted errors of 0.7 e⁻/s."""
+    size, unit = len(contrast), 0.7
+    fit = EdgeFit(*(np.asarray(v, np.float32) for v in (
+        np.ones(size), *np.zeros((3, size)), np.full(size, -0.4), np.full(size, 90.0), 90 + unit * np.array(contrast),
+        unit * np.array(scatter), fewer, np.full(size, 64.0),
+    )))  # fmt: skip
+    tracer = SimpleNamespace(
+        edges=lambda pixel, *_: fit.at(pixel), axis_factor=lambda pixel: np.ones(pixel.size, np.float32),
+        moves_within=lambda windows: moves,
+    )  # fmt: skip
+    pixel, wanted = np.arange(size), np.full(size, unit, np.float32)
+    given = np.full(size, law), np.ones(size, np.bool_), wanted, np.zeros(size), Gain(0.68, 0.7), TUNING
+    return about_edges(tracer, (pixel, 0 * pixel, None), *given)
+
+
 def test_pairs_of_low_contrast_take_the_rays_of_their_own_scatter():
     """Contrasts of 15 and 17 wanted errors, with 22 of 68 rays on one side: (0.68·(0.47·15 + 1))^(1/0.7) = 11 rays,
     but an eighth of the law at least, which gives 17 its rays.
     """
     contrast, scatter = np.array([15.0, 17.0, 15.0]), np.array([1.0, 1.0, 30.0])
-    fit = EdgeFit(*(np.asarray(v, np.float32) for v in (
-        np.ones(3), np.zeros(3), np.zeros(3), np.zeros(3), np.full(3, -0.4), np.full(3, 90.0), 90 + contrast, scatter,
-        np.full(3, 20.0), np.full(3, 64.0),
-    )))  # fmt: skip
-    tracer = SimpleNamespace(
-        edges=lambda pixel, *_: fit.at(pixel), axis_factor=lambda pixel: np.ones(pixel.size, np.float32),
-        moves_within=lambda windows: False,
-    )  # fmt: skip
-    pixel, law, ones = np.arange(3), np.full(3, 512), np.ones(3, np.float32)
-    given = law, ones > 0, ones, np.zeros(3), Gain(0.68, 0.7), TUNING
-    rays, edges = about_edges(tracer, (pixel, 0 * pixel, None), *given)
+    rays, edges = without_lines(contrast, scatter, np.full(3, 20.0), law=512, moves=False)
     # 0.68·37.0 = 25.2 is 100.4 rays
     assert rays.tolist() == [64, 512, 128] and edges is None
 
@@ -315,16 +321,7 @@ def test_the_scatter_of_two_levels_is_that_of_the_share_of_rays_on_either_side()
     wanted errors takes 256 rays, (0.68·71.3)^(1/0.7).
     """
     contrast, fewer = np.array([345.5, 349.0, 142.0, 143.5]), np.array([1, 1, 32, 32])
-    fit = EdgeFit(*(np.asarray(v, np.float32) for v in (
-        np.ones(4), np.zeros(4), np.zeros(4), np.zeros(4), np.full(4, -0.4), np.full(4, 90.0), 90 + contrast,
-        np.zeros(4), fewer, np.full(4, 64.0),
-    )))  # fmt: skip
-    tracer = SimpleNamespace(
-        edges=lambda pixel, *_: fit.at(pixel), axis_factor=lambda pixel: np.ones(pixel.size, np.float32),
-        moves_within=lambda windows: True,
-    )  # fmt: skip
-    pixel, law, ones = np.arange(4), np.full(4, 1024), np.ones(4, np.float32)
-    rays, _ = about_edges(tracer, (pixel, 0 * pixel, None), law, ones > 0, ones, np.zeros(4), Gain(0.68, 0.7), TUNING)
+    rays, _ = without_lines(contrast, np.zeros(4), fewer, law=1024, moves=True)
     assert rays.tolist() == [256, 512, 256, 512]
 
 

@@ -129,7 +129,10 @@ class AdaptiveRenderer:
         def wanted(flux: NDArray[np.float32]) -> NDArray[np.float32]:
             return np.float32(band.quality) * band.unit(flux)
 
-        few = self._clock.windows_of_a_pixel(*windows.span_us, windows.size - 1) if self.has_ticks else 1
+        # few rays look at blocks of ticks only; the bound of motion takes rays of its own where the camera moves
+        steps, few = len(numbers) - 1, 1
+        if self.has_ticks and steps > 1:
+            few = self._clock.windows_of_a_pixel(*windows.span_us, steps)
         pilot, near = take_pilot(*given, wanted, band.mild, few)
         if band.apart and pilot.windows > 2:
             # no neighbour tells when deep shadow ends

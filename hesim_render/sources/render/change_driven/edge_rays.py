@@ -73,7 +73,8 @@ def about_edges(
     # from here on in wanted errors: contrast, and rays by the law of stratified scatter
     contrast = (fit.high - fit.low) / wanted
     is_edge = fit.is_edge & (contrast >= 1)
-    # both sides belong to the scatter of a pair that has no edge; of few rays, the rarer side may have two more in 68
+    # both levels belong to the scatter of a pair that has no edge. Few rays may have missed the rarer one, so two rays
+    # more than were seen count on either side
     share = (fit.fewer + 2) / (fit.rays + 4)
     between = np.where(is_edge, 0, np.sqrt(share * (1 - share)) * contrast)
     by_scatter = gain.rays(between + fit.scatter / wanted)

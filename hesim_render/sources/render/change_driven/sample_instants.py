@@ -1,4 +1,4 @@
-"""Sample instants of an asynchronous sensor, dense enough to follow all motion."""
+"""Bounds of the motion in the image, and what follows: sample instants of asynchronous sensors, looks of others."""
 
 from collections.abc import Callable
 from math import ceil
@@ -22,7 +22,8 @@ LEAST_US = 10
 #: Cells for which distances are taken together, and the part of a distance that is relied on: between the rays that
 #: measure how far the scene is, something may be nearer.
 _CELLS, _SURE = 16, 0.5
-#: Largest number of ticks from one look of few rays to the next: with 8, no fewer rays were left to save.
+#: Largest number of ticks from one look of few rays to the next. Chosen on the sweep at 800 Hz, judged on the star, for
+#: which 8 would save another 4 % of the rays.
 _MOST_WINDOWS = 4
 #: Least depth of an object that is assumed, as a part of its distance from the camera.
 _NEAREST = 0.05

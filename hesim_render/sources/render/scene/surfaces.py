@@ -47,7 +47,9 @@ def is_diffuse(item: ObjectSpec) -> bool:
 
 
 def reflects_diffusely(mi: MitsubaModule, bsdf: MitsubaObject | None) -> bool:
-    """True if a BSDF has neither gloss nor mirror, glass or holes, so that rays of a pixel hardly differ on it."""
+    """True if a BSDF has neither gloss nor mirror, glass or holes, so that rays of a pixel hardly differ on it; False
+    without a BSDF.
+    """
     flags = None if bsdf is None else bsdf.flags()
     others = mi.BSDFFlags.Glossy, mi.BSDFFlags.Delta, mi.BSDFFlags.Delta1D
     return flags is not None and not any(mi.has_flag(flags, other) for other in others)
