@@ -3,10 +3,13 @@
 The audit does not influence the picture. Its units are stretches of successive windows of one pixel (`units`). Each
 stretch of time has the same number of units, and their pixels are drawn independently. For a sensor with a tick, only
 one window of a stretch is judged, so that correlated windows are not counted twice. The reference uses random numbers
-of its own, and so many rays that its error is a small part of the tolerance. Every bound holds with `CONFIDENCE` for
+of its own, and so many rays that its error is a small part of the tolerance. Frames are judged by their values, event
+pixels by how far ln x has changed since an earlier window, because their comparators see nothing else; the level itself
+only decides the rate of their noise events. Every bound holds with `CONFIDENCE` for
 the whole run, at whatever number of units the audit stops (`confidence`).
 """
 
+from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -16,7 +19,8 @@ from numpy.typing import NDArray
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.sources.protocol import AuditableFlux
 from hesim_render.sources.render.audit.compare import Counted, Tally, compare_crossings, compare_ticks
-from hesim_render.sources.render.audit.confidence import lower_bound, ratio_upper_bound, upper_bound
+from hesim_render.sources.render.audit.confidence import is_hopeless, lower_bound, ratio_upper_bound, upper_bound
+from hesim_render.sources.render.audit.deviations import of_changes, of_frames, summary
 from hesim_render.sources.render.audit.units import Batch, NotedFlux, Units, in_random_order
 from hesim_render.sources.render.change_driven.tuning import FINEST_QUALITY
 
@@ -68,7 +72,6 @@ class Audit:
     ) -> None:
         self._noted, self._source, self._quality, self._noise = noted, source, quality, noise
         #: Places of mosaic indices on the event grid.
-        #: Places of mosaic indices on the event grid.
         self._place_of = np.zeros(int(event_pixel.max(initial=0)) + 1, np.int64)
         self._place_of[event_pixel] = np.arange(event_pixel.size)
         self._rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, 2]))
@@ -116,7 +119,7 @@ class Audit:
             result = self._bounds(tally, events)
             shares, own, left = _shares(result), self._source.rays_traced - start, room - (start - begin)
             enough = all(bound <= most for _, bound, most in shares)
-            if enough or own > left or (own > _TRIED * room and _is_hopeless(shares, left / own)):
+            if enough or own > left or (own > _TRIED * room and is_hopeless(shares, left / own)):
                 break
         return result
 
@@ -151,9 +154,18 @@ class Audit:
         events, core, tolerance = which != "frames", units.core, TOLERANCE * self._quality
         reference, difference = self._reference(units, still, which)
         unit = self._source.noise_unit(units.pixel, reference, events)[core]
-        deviation, weight = np.abs(units.flux - reference)[core] / unit, np.where(still, 1 / _STILL_PART, 1.0)
-        tally.off[place] = weight * np.mean(deviation > tolerance, axis=0)
-        tally.expected[place] = weight * np.mean(np.abs(units.difference[core]) > tolerance * unit, axis=0)
+        weight = np.where(still, 1 / _STILL_PART, 1.0)
+        if events:
+            flux, (before, spread, known) = units.flux[core], self._earlier(units, reference)
+            log, own = partial(self._log, units.pixel), (flux, before)
+            deviation = of_changes(log, own, (reference[core], known), unit)
+            # what the stated error of the run does on its own
+            by_error = of_changes(log, (flux + units.difference[core], before + spread), own, unit)
+        else:
+            deviation = of_frames(units.flux[core], reference[core], unit)
+            by_error = of_frames(units.difference[core], np.zeros(unit.shape), unit)
+        tally.off[place] = weight * np.mean(deviation.is_off(tolerance), axis=0)
+        tally.expected[place] = weight * np.mean(by_error.is_off(tolerance), axis=0)
         tally.note(place, deviation, weight)
         if events:
             moving = np.flatnonzero(~still)
@@ -162,8 +174,30 @@ class Audit:
             for total, values in zip(vars(tally.events).values(), vars(counts).values(), strict=True):
                 total[place[moving]] = values
             # counts that errors as large as those of the run and of the reference cause on their own
-            by_error = self._compare(part, other + part.difference, other + difference[:, moving])
-            tally.by_error[place[moving]] = by_error.missed + by_error.extra + by_error.flips
+            counts = self._compare(part, other + part.difference, other + difference[:, moving])
+            tally.by_error[place[moving]] = counts.missed + counts.extra + counts.flips
+
+    def _earlier(
+        self, units: Units, reference: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Window that the changes of each unit are counted from, arrays [1, unit], e⁻/s: flux of the run, half the
+        difference of its halves, and flux of the reference.
+
+        It is the sample with which a comparator with a tick compares; an asynchronous one compares with the level of
+        its last event, for which the first window of the block stands.
+        """
+        if self._has_ticks:
+            first = max(0, int(np.flatnonzero(units.core)[0]) - 1)
+            row = slice(first, first + 1)
+            return units.flux[row], units.difference[row], reference[row]
+        span_us = units.base_begin_us[0], units.base_end_us[0]
+        base, _ = self._source.reference_flux(units.pixel, *span_us, _REFERENCE * self._quality, events=True)
+        return units.base_flux, units.base_difference, base[None]
+
+    @property
+    def _has_ticks(self) -> bool:
+        """True if each sample is compared with the one before it."""
+        return self._noise is not None and self._noise.spec.reference == "previous_sample"
 
     def _reference(
         self, units: Units, still: NDArray[np.bool_], which: str
@@ -185,12 +219,13 @@ class Audit:
         first = int(np.flatnonzero(units.core)[0])
         needed = np.repeat(units.core[:, None], units.pixel.size, axis=1)
         if first > 0 and which != "frames":
-            needed[first - 1] |= ~still
+            # changes of ticks are counted from this window, whatever may move
+            needed[first - 1] |= self._has_ticks | ~still
         # a unit without events in the run can only have missed ones: their windows are enough
         if which != "eventful":
             trace(needed)
             return reference, difference
-        if self._noise is not None and self._noise.spec.reference == "previous_sample":
+        if self._has_ticks:
             trace(needed)
             # where both have the same event in the tick that is judged, its neighbours have nothing to say
             unlike = self._tick_event(units, units.flux, first) != self._tick_event(units, reference, first)
@@ -240,22 +275,17 @@ class Audit:
 
     def _bounds(self, tally: Tally, events: bool) -> dict[str, Any]:
         off, most = tally.off[: tally.looked_at], 1 / _STILL_PART if events else 1.0
-        deviation, weight = tally.deviations()
-        cumulated = np.cumsum(weight)
-        parts = {name: deviation[np.searchsorted(cumulated, p * cumulated[-1])] for name, p in _PARTS.items()}
         bounds: dict[str, Any] = {
             "units": int(off.size),
             "off": float(off.mean()),
             "off_at_most": min(1.0, most * upper_bound(off / most, CONFIDENCE)),
             "off_wanted_at_most": MOST_OFF,
-            "deviation_noise": {
-                "rms": float(np.sqrt(np.sum(weight * deviation**2) / weight.sum())),
-                **{name: float(value) for name, value in parts.items()},
-                "largest": float(deviation[-1]),
-            },
+            "deviation_noise": summary(*tally.deviations()),
             "off_by_stated_error_alone": float(tally.expected[: tally.looked_at].mean()),
         }
-        return bounds | self._event_bounds(tally) if events else bounds
+        if not events:
+            return bounds
+        return bounds | {"level_deviation": summary(*tally.deviations(of_levels=True))} | self._event_bounds(tally)
 
     def _event_bounds(self, tally: Tally) -> dict[str, Any]:
         """Bounds of missed and extra events. Units in which nothing can move have neither."""
@@ -312,19 +342,6 @@ def _shares(part: dict[str, Any]) -> list[tuple[float, float, float]]:
     names += ["missed"] if part.get("true_events") else []
     names += ["extra"] if part.get("found_events") else []
     return [(part[name], part[f"{name}_at_most"], part[f"{name}_wanted_at_most"]) for name in names]
-
-
-def _is_hopeless(shares: list[tuple[float, float, float]], times: float) -> bool:
-    """True if so many times the units would hardly change the verdict. The distance of a bound from its estimate falls
-    with the root of their number: it would not be below the limit, or the estimate is as far above it.
-    """
-    return any(
-        share + (bound - share) / np.sqrt(times) > most if share <= most else share - (bound - share) > most
-        for share, bound, most in shares
-    )
-
-
-_PARTS = {"median": 0.5, "p95": 0.95, "p99": 0.99}
 
 
 def _rounded_down(value: float) -> float:

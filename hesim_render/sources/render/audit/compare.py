@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.sources.render.audit.deviations import Deviations
+
 #: An event counts as missed or extra only if its signal exceeds the threshold by this many standard errors.
 SURE = 3.0
 
@@ -147,19 +149,28 @@ class Tally:
         self.events = Counted(*(np.zeros(units) for _ in range(5)))
         self.has_event = np.zeros(units, np.bool_)
         self.eventful = self.looked_at = 0
-        self._deviations: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]] = []
+        self._deviations: list[tuple[NDArray[np.int64], Deviations, NDArray[np.float64]]] = []
 
-    def note(self, place: NDArray[np.int64], deviation: NDArray[np.float64], weight: NDArray[np.float64]) -> None:
-        """Note absolute deviations of some units, [window, unit], in units of noise, with the weight of each unit."""
-        each = np.broadcast_to(place, deviation.shape), deviation, np.broadcast_to(weight, deviation.shape)
-        self._deviations.append(tuple(values.ravel() for values in each))  # type: ignore[arg-type]
+    def note(self, place: NDArray[np.int64], deviation: Deviations, weight: NDArray[np.float64]) -> None:
+        """Note deviations of some units, with the weight of each unit."""
+        self._deviations.append((place, deviation, weight))
 
-    def deviations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Deviations and weights of all examined units, in increasing order of deviation."""
-        place, deviation, weight = (np.concatenate(values) for values in zip(*self._deviations, strict=True))
-        # units in their random order, up to the last of the part that was examined as a whole
-        among = np.flatnonzero(place < self.looked_at)
-        order = among[np.argsort(deviation[among])]
+    def deviations(self, of_levels: bool = False) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Deviations and weights of all examined units, in increasing order of deviation.
+
+        Parameters
+        ----------
+        of_levels : those of levels, `Deviations.level`, in place of what is judged.
+        """
+        parts = []
+        for place, deviations, weight in self._deviations:
+            values = deviations.level if of_levels else deviations.noise
+            assert values is not None
+            # units in their random order, up to the last of the part that was examined as a whole
+            among = place < self.looked_at
+            parts.append((values[:, among].ravel(), np.broadcast_to(weight, values.shape)[:, among].ravel()))
+        deviation, weight = (np.concatenate(part) for part in zip(*parts, strict=True))
+        order = np.argsort(deviation)
         return deviation[order], weight[order]
 
     def rate(self, values: NDArray[np.float64]) -> float:

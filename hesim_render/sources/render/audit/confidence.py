@@ -77,3 +77,13 @@ def _least(gain: Callable[[float], NDArray[np.float64]], confidence: float, coun
         else:
             low = middle
     return float(high)
+
+
+def is_hopeless(shares: list[tuple[float, float, float]], times: float) -> bool:
+    """True if so many times the units would hardly change the verdict. The distance of a bound from its estimate falls
+    with the root of their number: it would not be below the limit, or the estimate is as far above it.
+    """
+    return any(
+        share + (bound - share) / np.sqrt(times) > most if share <= most else share - (bound - share) > most
+        for share, bound, most in shares
+    )

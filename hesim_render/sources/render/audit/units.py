@@ -16,7 +16,8 @@ from hesim_render.sources.protocol import FluxSource, Sample
 
 #: Approximate number of units noted in a run.
 _UNITS = 200_000
-_BY_WINDOW = ("begin_us", "end_us", "flux", "difference", "error")
+_OF_UNITS = ("begin_us", "end_us", "flux", "difference", "error")
+_OF_BASE = ("base_begin_us", "base_end_us", "base_flux", "base_difference")
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class Units:
     flux : flux that the source gave, e⁻/s.
     difference : half the difference of the two halves, e⁻/s; it has the distribution of the flux's own error.
     error : standard error that the source states, e⁻/s; 0 where it states none.
+    base_begin_us, base_end_us, base_flux, base_difference : [1, unit], the same of the window that changes are counted
+        from: the first one of the block in which the unit begins. Of frames, the window itself.
     """
 
     pixel: NDArray[np.uint32]
@@ -40,16 +43,21 @@ class Units:
     flux: NDArray[np.float64]
     difference: NDArray[np.float64]
     error: NDArray[np.float64]
+    base_begin_us: NDArray[np.float64]
+    base_end_us: NDArray[np.float64]
+    base_flux: NDArray[np.float64]
+    base_difference: NDArray[np.float64]
 
     def at(self, place: NDArray) -> "Units":
         """Some of the units."""
-        values = {name: getattr(self, name)[:, place] for name in _BY_WINDOW}
+        values = {name: getattr(self, name)[:, place] for name in _OF_UNITS + _OF_BASE}
         return Units(pixel=self.pixel[place], core=self.core, **values)
 
     @classmethod
     def joined(cls, parts: "Sequence[Units]") -> "Units":
         """Join units of the same shape."""
-        values = {name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in _BY_WINDOW}
+        names = _OF_UNITS + _OF_BASE
+        values = {name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in names}
         return cls(pixel=np.concatenate([part.pixel for part in parts]), core=parts[0].core, **values)
 
 
@@ -87,11 +95,13 @@ def in_random_order(noted: Sequence[Units], rng: np.random.Generator, least: int
 class _Open:
     """Units that are still being noted: places in the list, windows left until they are full, and values so far.
 
-    `skipped` is the number of windows of a unit that lie before the first window of the run.
+    `skipped` is the number of windows of a unit that lie before the first window of the run; `base` is the window that
+    its changes are counted from, with its flux and half the difference of its halves.
     """
 
     place: NDArray[np.int64]
     skipped: int
+    base: "tuple[tuple[float, float], NDArray[np.float64]] | None" = None
     windows: list[tuple[float, float]] = field(default_factory=list)
     halves: list[NDArray[np.float64]] = field(default_factory=list)
     error: list[NDArray[np.float64]] = field(default_factory=list)
@@ -157,6 +167,7 @@ class NotedFlux:
                     np.asarray(pixel)[place],
                     *(begin, end, np.ones(1, np.bool_)),
                     *(flux[None], difference[None], 0 * flux[None]),
+                    *(begin, end, flux[None], difference[None]),
                 )
             )
         return halves
@@ -165,28 +176,40 @@ class NotedFlux:
         """See `FluxSource.flux_of_blocks`."""
         among = np.flatnonzero(np.isin(pixel, self._event_pixel))
         times: deque[tuple[float, float]] = deque()
+        #: Of each window to come: is it the first wanted one of its block, and does the block begin there?
+        begins: deque[tuple[bool, bool]] = deque()
 
         def noted(blocks: Iterable[Block]) -> Iterator[Block]:
             for block in blocks:
-                begin, end = block.begin_us[block.wanted], block.end_us[block.wanted]
-                times.extend(zip(begin.tolist(), end.tolist(), strict=True))
+                wanted = np.flatnonzero(block.wanted)
+                times.extend(zip(block.begin_us[wanted].tolist(), block.end_us[wanted].tolist(), strict=True))
+                begins.extend((k == wanted[0], k == 0) for k in wanted.tolist())
                 yield block
 
         units: deque[_Open] = deque()
+        base: tuple[tuple[float, float], Halves] | None = None
+        last: tuple[tuple[float, float], Halves] | None = None
         if among.size:
             # units at the begin of the run have fewer windows before the judged ones
             units.extend(self._open(among, skipped) for skipped in range(self._before, 0, -self._core))
         for number, sample in enumerate(self.source.flux_of_blocks(pixel, noted(blocks))):
-            window = times.popleft()
+            window, (is_first, is_own) = times.popleft(), begins.popleft()
+            halves = sample.half_a, sample.half_b
+            if is_first or base is None:
+                # the first window of a block is the last one of the block before, where there was one
+                base = (window, halves) if is_own or last is None else last
             if among.size and (number + self._before) % self._core == 0:
                 units.append(self._open(among, 0))
             for one in units:
+                if one.base is None:
+                    one.base = base[0], _mean_and_difference(base[1], one.place)
                 one.windows.append(window)
-                one.halves.append(_mean_and_difference((sample.half_a, sample.half_b), one.place))
+                one.halves.append(_mean_and_difference(halves, one.place))
                 nothing = np.zeros(one.place.size)
                 one.error.append(nothing if sample.error is None else sample.error[one.place].astype(np.float64))
             while units and len(units[0].halves) + units[0].skipped == self._before + self._core + self._after:
                 self._close(pixel, units.popleft())
+            last = window, halves
             yield sample
         for one in units:
             self._close(pixel, one)
@@ -201,7 +224,12 @@ class NotedFlux:
         if core.any():
             begin, end = (np.repeat(t[:, None], one.place.size, axis=1) for t in np.array(one.windows).T)
             flux, difference = np.array(one.halves).swapaxes(0, 1)
-            self.events.append(Units(pixel[one.place], begin, end, core, flux, difference, np.array(one.error)))
+            assert one.base is not None
+            (base_begin, base_end), of_base = one.base
+            count = one.place.size
+            base = np.full((1, count), base_begin), np.full((1, count), base_end), of_base[:1], of_base[1:]
+            given = pixel[one.place], begin, end, core, flux, difference, np.array(one.error)
+            self.events.append(Units(*given, *base))
 
 
 def _mean_and_difference(halves: Halves, place: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -55,7 +55,7 @@ class AdaptiveRenderer:
     """
 
     def __init__(self, tracer: PairTracer, noise: Noise, quality: float, tuning: Tuning, clock: MotionClock) -> None:
-        self.tracer, self.noise, self.quality, self.tuning, self._clock = tracer, noise, quality, tuning, clock
+        self.tracer, self.noise, self.quality, self._clock = tracer, noise, quality, clock
         self.gain = Gain(*(tuning.diffuse_gain if tracer.is_diffuse else tuning.path_gain))
         self.counts = Counts()
         self._sensor = tracer.sensor
@@ -64,6 +64,10 @@ class AdaptiveRenderer:
         # windows of an asynchronous sensor are so close that nothing moves far from one to the next
         self.has_ticks = evs is None or evs.tick_us is not None
         self.look_stride = 1 if self.has_ticks else tuning.look_stride
+        # an asynchronous pixel is looked at so seldom that more rays for the small changes of paths cost little
+        if not (tracer.is_diffuse or self.has_ticks):
+            tuning = replace(tuning, pilot_rays=tuning.path_pilot_rays)
+        self.tuning = tuning
         self.zoom = Zoom(tracer.view, tracer.camera, tracer.parts.groups, tuning, rays.can_aim, rays.blur_px)
         self._kept: dict[Role, Still] = {}
 
