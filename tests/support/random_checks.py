@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from unittest import mock
 
@@ -73,6 +73,8 @@ class _Seen(NotedFlux):
     def __init__(self, source, event_pixel, *rest) -> None:
         super().__init__(source, event_pixel, *rest)
         self.pixels, self.windows, self.flux, self.error = event_pixel, [], [], []
+        #: Number of the window in which the block of each window begins.
+        self.begins: list[int] = []
         _Seen.made.append(self)
 
     def flux_of_blocks(self, pixel, blocks):
@@ -80,6 +82,9 @@ class _Seen(NotedFlux):
 
         def told():
             for block in blocks:
+                # the first window of a block is the last one of the block before
+                begin = len(self.windows) - (not block.wanted[0] and bool(self.windows))
+                self.begins += [begin] * int(block.wanted.sum())
                 self.windows += np.stack([block.begin_us, block.end_us], axis=1)[block.wanted].tolist()
                 yield block
 
@@ -97,8 +102,9 @@ def judged_run(random: RandomScene, most_windows: int = 24) -> dict[str, Any]:
     Returns
     -------
     Plain values: `mode` and `verdict` of the run. ``off``, ``missed`` and ``extra``: count, total, and the bound of the
-    audit; values that are off are those of the pixels drawn at random. `values`: of all values, in noise units, where
-    the reference is exact enough (`exact` of `all`): mean deviation, number off, and mean square over the errors.
+    audit, which judges changes; values that are off are those of the pixels drawn at random. `values`: of all values,
+    in noise units, where the reference is exact enough (`exact` of `all`): mean deviation, number off, and mean square
+    over the errors.
     """
     _Seen.made.clear()
     with mock.patch("hesim_render.capture.scene_run.NotedFlux", _Seen):
@@ -118,14 +124,21 @@ def judged_run(random: RandomScene, most_windows: int = 24) -> dict[str, Any]:
     at_random = np.arange(pixels) >= pixels // 2
     if busy.size:
         chosen[: pixels // 2] = rng.choice(busy, pixels // 2)
+    # the windows of the stretch, and those that their changes are counted from
+    windows = np.arange(len(seen.windows))[part]
+    earlier = np.array(seen.begins)[part] if random.is_asynchronous else np.maximum(windows - 1, 0)
+    every, place = np.unique([windows, earlier], return_inverse=True)
+    wanted = 0.2 * QUALITY * np.maximum(unit[every][:, chosen], 1e-9)
+    looked = reference.flux([seen.windows[k] for k in every], seen.pixels[chosen], wanted, seed=random.seed)
+    is_off = off_by_change(reference.sensor, chosen, flux[every][:, chosen], looked.flux, *place.reshape(2, -1))
     own, stated, unit = flux[part, chosen], error[part, chosen], np.maximum(unit[part, chosen], 1e-9)
-    found = reference.flux(seen.windows[part], seen.pixels[chosen], 0.2 * QUALITY * unit, seed=random.seed)
+    found = replace(looked, **{name: getattr(looked, name)[place.reshape(2, -1)[0]] for name in ("flux", "stderr")})
     counted = count_events(reference.sensor, chosen, own, found.flux, stated, found.stderr)
     deviation, exact = (own - found.flux) / unit, found.stderr <= 1.5 * 0.2 * QUALITY * unit
     square = (deviation**2 / ((stated**2 + found.stderr**2) / unit**2 + QUALITY**2))[exact]
     off = np.abs(deviation) > 3 * QUALITY
     events = audit["events"]
-    counts = {"off": (int(off[:, at_random].sum()), int(off[:, at_random].size))}
+    counts = {"off": (int(is_off[:, at_random].sum()), int(is_off[:, at_random].size))}
     for name, of in (("missed", "true"), ("extra", "in_run")):
         counts[name] = float(getattr(counted, name).sum()), float(getattr(counted, of).sum())
     return {
@@ -137,6 +150,18 @@ def judged_run(random: RandomScene, most_windows: int = 24) -> dict[str, Any]:
             "mean_square": float(square.mean()) if exact.any() else 0.0,
         },
     }  # fmt: skip
+
+
+def off_by_change(sensor, chosen, own, reference, now, earlier) -> np.ndarray:
+    """Values in the windows `now` whose change of ln x since `earlier` is off by more than three wanted errors, or
+    whose level is, and by more than a tenth; fluxes are [window, pixel], e⁻/s.
+    """
+    level = sensor.evs.log_signal(own, chosen) - sensor.evs.log_signal(reference, chosen)
+    full = sensor.layout.full_index.ravel()[sensor.layout.evs_pixel.ravel()[chosen]]
+    unit = Noise(sensor).of("events", full)(reference[now].astype(np.float32))
+    unit = sensor.evs.log_signal(reference[now] + unit, chosen) - sensor.evs.log_signal(reference[now], chosen)
+    change, most = np.abs(level[now] - level[earlier]), 3 * QUALITY * unit
+    return (change > most) | (np.abs(level[now]) > np.maximum(most, 0.1))
 
 
 def count_events(sensor, chosen, own, reference, stated, reference_error) -> Counted:
