@@ -34,9 +34,9 @@ class Tuning:
         changes and how many rays it gets. Half as many: edges appear to move in steps of 1/8 pixel.
     lone_pilot_rays : rays, F. Pilot rays where these pixels lie apart (event pixels of a hybrid tile). Without (as few
         as `pilot_rays`): changes are missed, because such pixels have no neighbours to show them.
-    path_pilot_rays : rays, F. As `pilot_rays`, of asynchronous pixels that see paths; chosen on `benchmarks/scenes/room`
-        and `floor-ball`, judged on `sky-knot`. Without (as few as `pilot_rays`): changes of bounced light are in so few
-        of the rays that windows between rendered ones are further off.
+    path_pilot_rays : rays, F. As `pilot_rays`, of asynchronous pixels that see paths; chosen on `room` and `floor-ball`
+        of `benchmarks/scenes`, judged on `sky-knot` there. Without (as few as `pilot_rays`): so few of the rays show
+        changes of bounced light that windows between rendered ones are further off.
     frame_pilot_rays : rays, H. Pilot rays of a frame pixel in an exposure. Without: objects that pass in a small part
         of the exposure are missed.
     look_stride : windows, C. The pilot of an asynchronous sensor looks at every so many windows; where two looks
@@ -120,9 +120,10 @@ class Tuning:
         rays see none either.
     difference_gain : factor, C. A pair is rendered as a difference where that takes this many times fewer rays. Without
         (1): windows to compare with are rendered for little.
-    difference_part : wanted errors, F. Wanted error of a difference; an event pixel compares with a window that has the
-        error of the other one too. Chosen on the star and on `benchmarks/scenes/room` and `floor-ball`, judged on
-        `pendulum`, `robot-arm` and `sky-knot`. Half as large: up to a third more rays make no error smaller.
+    difference_part : wanted errors, F. Wanted error of a difference; that of the other window comes on top, but cancels
+        where an event pixel compares both. Chosen on the star and on `benchmarks/scenes/room` and `floor-ball`, judged
+        on `pendulum`. Without (1): changes of bounced light are off by a fifth more. Half as large: a tenth more rays
+        make no error smaller.
     difference_factor : factor, F. From the star alone, windows 4 to 60 ms apart: the standard error of a difference of
         n rays is this times their scatter over √n, because few rays change, and strata gain little. Without (0.5):
         differences are off by twice what they should.
@@ -185,7 +186,7 @@ class Tuning:
     flat_part: float = 1 / 8
     least_difference_rays: int = 64
     difference_gain: float = 4.0
-    difference_part: float = 1.0
+    difference_part: float = 0.7
     difference_factor: float = 0.95
     unseen_change: float = 0.5
     audit_pilot_rays: int = 64
