@@ -12,7 +12,7 @@ from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
 from hesim_render.recording import manifest as manifests
-from hesim_render.recording.geometry import scene_of
+from hesim_render.recording.rebuilt_scene import scene_of
 from hesim_render.recording.recording import Recording, as_recording
 from hesim_render.sensor.lens import Lens
 from hesim_render.sensor.sensor import Sensor

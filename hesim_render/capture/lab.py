@@ -1,7 +1,7 @@
 """A virtual calibration session: the captures that a person would make with the sensor on a bench.
 
 Frames and events come from the same noise models and the same event stage as in a simulation. The light
-is that of `hesim_render.capture.bench`.
+is that of `hesim_render.capture.lab_bench`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.capture.bench import Bench, set_up, truth_of
+from hesim_render.capture.lab_bench import Bench, set_up, truth_of
 from hesim_render.capture.lab_trials import TrialBench, TrialPlan, plan_trials
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr

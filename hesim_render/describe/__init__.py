@@ -1,8 +1,8 @@
 """What a sensor does, from its file alone: curves against light, photon transfer, spectral response, tables."""
 
+from hesim_render.describe.curve_picture import write_picture
 from hesim_render.describe.curves import EventCurves, event_curves, photon_transfer, s_curve
 from hesim_render.describe.motion import motion_figures, motion_lines, write_motion
-from hesim_render.describe.picture import write_picture
 from hesim_render.describe.table import Row, figures_of, table_lines
 
 __all__ = [

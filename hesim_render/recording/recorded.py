@@ -200,7 +200,7 @@ class Recorded:
         SpecError
             If it is another scene.
         """
-        from hesim_render.recording.geometry import geometry_of
+        from hesim_render.recording.rebuilt_scene import geometry_of
 
         return geometry_of(self.manifest, self.path, scene)
 

@@ -46,6 +46,10 @@ def colour_samples(
     reflectances : of the surfaces.
     light_name : for errors.
 
+    Returns
+    -------
+    Channels and XYZ of every surface, and XYZ of white.
+
     Examples
     --------
     >>> import hesim_render as hr

@@ -15,8 +15,8 @@ import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
 from hesim_render.calibrate.summary import summary_lines
 from hesim_render.capture import lab_trials
-from hesim_render.capture.bench import Bench, set_up, step_target, truth_of
 from hesim_render.capture.lab import DARK_EXPOSURES_US, LIT_EXPOSURES_US, _describe, _Session, write_captures
+from hesim_render.capture.lab_bench import Bench, set_up, step_target, truth_of
 from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.errors import OutputError, RangeError, SpecError
 from hesim_render.core.npz import NpzWriter

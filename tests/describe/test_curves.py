@@ -11,7 +11,7 @@ import hesim_render as hr
 from hesim_render.core import drawing
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.describe import curves, event_curves, figures_of, photon_transfer, picture, s_curve, table_lines
+from hesim_render.describe import curve_picture, curves, event_curves, figures_of, photon_transfer, s_curve, table_lines
 from hesim_render.describe.table import TABLE_LUX
 from hesim_render.pixels.evs.noise_rates import events_per_period
 from hesim_render.pixels.evs.stage import EvsStage
@@ -376,8 +376,8 @@ def test_noise_and_latency_have_no_kink_where_the_dark_current_begins(name):
 def test_texts_on_the_axes_of_the_picture_do_not_overlap(name, tmp_path, monkeypatch):
     """And the point of the data sheet, which counts all events, lies on a curve that counts all events."""
     drawn = []
-    monkeypatch.setattr(picture, "new_figure", lambda size: drawn.append(drawing.new_figure(size)) or drawn[-1])
-    picture.write_picture(hr.load_sensor(name), tmp_path / "p.png")
+    monkeypatch.setattr(curve_picture, "new_figure", lambda size: drawn.append(drawing.new_figure(size)) or drawn[-1])
+    curve_picture.write_picture(hr.load_sensor(name), tmp_path / "p.png")
     (figure,) = drawn
     # three drawings a row at most, those that are not there left out
     axes = [each for each in figure.axes if each.axison]

@@ -6,7 +6,7 @@ import pytest
 from hesim_render.core.backend import jit
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import partners
-from hesim_render.pixels.evs.balance import CAUSE, EFFECT, Balance, LastSteps, PixelSteps
+from hesim_render.pixels.evs.cause_pairs import CAUSE, EFFECT, Balance, LastSteps, PixelSteps
 from hesim_render.pixels.evs.events import EventLabels, Label, Lost
 from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise

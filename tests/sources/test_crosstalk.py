@@ -159,7 +159,7 @@ def test_rolling_shutter_in_changing_light():
 
 
 def test_bench_of_the_lab_sees_it_too():
-    from hesim_render.capture.bench import set_up
+    from hesim_render.capture.lab_bench import set_up
 
     sensor = hr.load_sensor("eiger", {"geometry.crosstalk": PART}).crop(80, 48)
     bench = set_up(sensor, (1000, 4000))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
-from hesim_render.pixels.evs.balance import CAUSE, EFFECT, Balance, LastSteps, PixelSteps
+from hesim_render.pixels.evs.cause_pairs import CAUSE, EFFECT, Balance, LastSteps, PixelSteps
 from hesim_render.pixels.evs.events import Label, Origin
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.on_device import Map

@@ -11,7 +11,7 @@ from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.guard import reading
 from hesim_render.sources.video.colours import ColourTags
 from hesim_render.sources.video.digest import Hashed
-from hesim_render.sources.video.picture import PictureFormat, PictureLayout, Planes, Timing, check_values
+from hesim_render.sources.video.picture_layout import PictureFormat, PictureLayout, Planes, Timing, check_values
 
 
 def picture_bits(dtype: np.dtype, bit_depth: int | None, name: str) -> int:

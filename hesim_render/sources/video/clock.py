@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.units import US_PER_S
-from hesim_render.sources.video.picture import Timing
+from hesim_render.sources.video.picture_layout import Timing
 
 
 class Clock:

@@ -13,7 +13,7 @@ import numpy as np
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reason, require_plain
 from hesim_render.sources.video.digest import Hashed
-from hesim_render.sources.video.picture import Planes, Timing
+from hesim_render.sources.video.picture_layout import Planes, Timing
 from hesim_render.sources.video.pyav import frame_format, planes_of, require_decodable, tags_of
 
 _PIECE_BYTES = 1 << 20

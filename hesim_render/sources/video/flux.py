@@ -26,7 +26,7 @@ from hesim_render.sources.video.inversion import camera_matrix, lux_of, spectral
 from hesim_render.sources.video.linear import Lineariser
 from hesim_render.sources.video.motion import MotionVideo
 from hesim_render.sources.video.options import WHITE_LUX, VideoOptions
-from hesim_render.sources.video.picture import Reader
+from hesim_render.sources.video.picture_layout import Reader
 from hesim_render.spectral import spectrum as spectra
 
 Source = str | Path | NDArray

@@ -14,7 +14,7 @@ from hesim_render.core.guard import WholeFile, reading, require_memory
 from hesim_render.sources.video.arrays import picture_bits, without_alpha
 from hesim_render.sources.video.colours import ColourTags
 from hesim_render.sources.video.digest import Hashed
-from hesim_render.sources.video.picture import PictureFormat, PictureLayout, Planes, Timing, check_values
+from hesim_render.sources.video.picture_layout import PictureFormat, PictureLayout, Planes, Timing, check_values
 from hesim_render.sources.video.pyav import decode_picture
 from hesim_render.spectral.transfer import InputTransfer
 

@@ -7,7 +7,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.sources.video.colours import ColourTags, code_scale, yuv_to_rgb
-from hesim_render.sources.video.picture import PictureFormat, Planes
+from hesim_render.sources.video.picture_layout import PictureFormat, Planes
 from hesim_render.spectral.transfer import decode
 
 #: Steps of a transfer table between 0 and 1. The error of linear interpolation is at most 2e-6 of white.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
-from hesim_render.sources.video.picture import Planes, Reader
+from hesim_render.sources.video.picture_layout import Planes, Reader
 
 _NAMES = {(0, 0): "yuv444p", (1, 0): "yuv422p", (1, 1): "yuv420p", (0, 1): "yuv440p", (2, 0): "yuv411p"}
 

@@ -10,7 +10,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import WholeFile, reason, require_picture
 from hesim_render.sources.video.arrays import without_alpha
 from hesim_render.sources.video.colours import ColourTags
-from hesim_render.sources.video.picture import PictureFormat, Planes
+from hesim_render.sources.video.picture_layout import PictureFormat, Planes
 
 #: Formats that differ from a supported one only in the order of numbers: swscale only moves these.
 _REORDERED = {

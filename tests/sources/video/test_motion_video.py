@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.video.motion import MotionVideo
-from hesim_render.sources.video.picture import PictureFormat
+from hesim_render.sources.video.picture_layout import PictureFormat
 
 ROWS, COLS, COUNT = 46, 70, 4
 

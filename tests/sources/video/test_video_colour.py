@@ -17,7 +17,7 @@ from hesim_render.sources.video import VideoFlux, VideoOptions
 from hesim_render.sources.video.colours import ColourTags, to_linear_srgb
 from hesim_render.sources.video.inversion import camera_matrix, spectral_matrix, surface_basis, white_flux
 from hesim_render.sources.video.linear import Lineariser
-from hesim_render.sources.video.picture import PictureFormat
+from hesim_render.sources.video.picture_layout import PictureFormat
 from hesim_render.spectral import transfer
 from hesim_render.spectral.spectrum import illuminant
 

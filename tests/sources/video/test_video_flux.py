@@ -14,7 +14,7 @@ from hesim_render.sources.video import estimate as video_estimate
 from hesim_render.sources.video.arrays import ArrayVideo
 from hesim_render.sources.video.clock import Clock
 from hesim_render.sources.video.geometry import mapping
-from hesim_render.sources.video.picture import Timing
+from hesim_render.sources.video.picture_layout import Timing
 
 #: One e⁻/s per unit of a linear picture.
 UNIT = {"transfer": "linear", "white_e_per_s": 1.0, "white_filter": "clear"}

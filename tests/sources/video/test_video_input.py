@@ -19,7 +19,7 @@ from hesim_render.sources.video.colours import ColourTags
 from hesim_render.sources.video.digest import Digest, Hashed
 from hesim_render.sources.video.folder import FolderVideo
 from hesim_render.sources.video.linear import Lineariser
-from hesim_render.sources.video.picture import PictureFormat
+from hesim_render.sources.video.picture_layout import PictureFormat
 
 
 def opened(source, **options):
