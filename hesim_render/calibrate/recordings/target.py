@@ -17,6 +17,7 @@ from scipy import special
 from scipy.ndimage import uniform_filter
 
 from hesim_render.calibrate.estimate import Z_95, estimated, not_identifiable
+from hesim_render.calibrate.recordings.ramps import jitter
 from hesim_render.calibrate.recordings.rests import overshoots, quantile_us, rests
 from hesim_render.calibrate.recordings.still import UNSURE_LEAK, jackknife
 from hesim_render.calibrate.recordings.tally import GROUPS, EventTally
@@ -153,7 +154,7 @@ def _course(tally: EventTally, leak_hz: float, period_s: float, ratio: float) ->
     if both is None:
         none, half = np.zeros(_PIXELS), 0.5 * leak_hz * period_s
         return _Course(none, none, (half, half), UNSURE_LEAK * half, np.zeros((2, 2)))
-    top, bottom = overshoots(*both, _PIXELS)
+    top, bottom = overshoots(*both, _PIXELS, jitter(tally), ratio)
     ramp_s = 0.5 * max(period_s - both[0].ramps.rest_s - both[1].ramps.rest_s, 0.0)
     leaks = top.drift, -bottom.drift * ratio
     ramp_leak_hz = 0.5 * (leaks[0] + leaks[1])
