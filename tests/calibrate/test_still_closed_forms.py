@@ -234,7 +234,7 @@ def test_pixels_that_see_a_steady_change_are_of_no_still_scene(monkeypatch, turn
     (800, 0.26, 4, 9300, True), (100, 0.59, 4, 0, False), (100, 0.61, 4, 0, True),
 ])  # fmt: skip
 def test_squares_whose_rate_changes_are_of_a_scene_that_moves(events, part, squares, others, is_seen):
-    """Difference over sum of their events beyond a quarter and six errors of counting; four squares, a quarter of all."""
+    """Difference over sum of their events beyond a quarter and six errors of counting; four squares of a quarter."""
     halves = np.zeros((2, 40, 30))  # 3 rows and 2 columns of squares, some of them cut
     begins = [(0, 0), (16, 16), (32, 0), (32, 17)][:squares]
     for k, (row, col) in enumerate(begins):

@@ -84,7 +84,7 @@ class Rest(NamedTuple):
     Parameters
     ----------
     ramps : of it.
-    edges_s : times since its begin between which late events are counted.
+    edges_s : times since its begin between which late events are counted; its end alone where none can be.
     late, of : late events between these times, and all visits of pixels.
     scatter : variance of late events over groups of pixels, over their mean; 1 at least.
     is_noisy : noise brings events back at this rest.
@@ -170,6 +170,8 @@ def quantile_us(counts: NDArray, part: float = 0.5) -> float:
 def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] | None:
     """The rests at the top and at the bottom of the light; None where it has none, or not the same for all pixels.
 
+    A rest that is too short for late events has none of them, in no time.
+
     Parameters
     ----------
     tally : of the target.
@@ -195,8 +197,11 @@ def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] 
         first_s = max(_EARLY * rest_s, _INTERVALS * max(up_s, down_s), _later_s(tally, k))
         octaves = np.arange(np.floor(np.log2(rest_s / first_s)), -1, -1)
         edges_s = np.asarray(rest_s / 2.0**octaves, np.float64)
-        if edges_s.size < 2:
-            return None
+        drift = leak_hz if k == 0 else -leak_hz / ratio
+        ramps = Ramps((1 / up_s, own / down_s), drift, rest_s)
+        if edges_s.size < 2:  # too short beside the intervals of the ramp
+            result.append(Rest(ramps, np.array([rest_s]), np.empty(0), float(whole.sum()), 1.0, False))
+            continue
         # times before the fall, as edges of the histogram; a late event is at its level, so that a threshold of the
         # other polarity lies between it and the first event of the fall
         end_s = rest_s + down_s
@@ -211,9 +216,6 @@ def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] 
             edges_s, late = edges_s[1:], late[:, 1:]
         each = late.sum(axis=1)
         scatter = each.var(ddof=1) / each.mean() if each.mean() > 1 else 1.0
-        drift = leak_hz if k == 0 else -leak_hz / ratio
-        slopes = 1 / up_s, own / down_s
-        ramps = Ramps(slopes, drift, rest_s)
         # noise makes as many late events in each factor of two of the time, the leak as many in each second
         by_leak = _LEAK[-1] * max(drift, 0.0) * np.diff(edges_s) * whole.sum()
         before, last = (late.sum(axis=0) - by_leak)[-2:] if edges_s.size > 2 else (np.inf, 0.0)
@@ -302,7 +304,7 @@ def _posterior(rest: Rest) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     own = -0.5 * (np.log(_leaks(rest)) / _LEAK_DEVIATION)[:, None, None] ** 2
     if rest.is_noisy:
         return own + log_chance(rest.late.sum(keepdims=True), expected.sum(axis=-1, keepdims=True)), mean
-    tails = _tails(rest.late)
+    tails = _tails(rest.late) if rest.late.size else []
     chances = [log_chance(rest.late, expected)]
     chances += [log_chance(rest.late, expected + tail) - np.log(len(tails)) for tail in tails]
     return own + special.logsumexp(chances, axis=0), mean

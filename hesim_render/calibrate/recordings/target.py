@@ -150,11 +150,11 @@ class _Course(NamedTuple):
 
 def _course(tally: EventTally, leak_hz: float, period_s: float, ratio: float) -> _Course:
     """Overshoots by what comes late at the rests of the light; light without rests turns without any."""
-    both = rests(tally, leak_hz, ratio)
-    if both is None:
+    both, of_ramps = rests(tally, leak_hz, ratio), jitter(tally)
+    if both is None or (of_ramps is None and not all(rest.late.size for rest in both)):
         none, half = np.zeros(_PIXELS), 0.5 * leak_hz * period_s
         return _Course(none, none, (half, half), UNSURE_LEAK * half, np.zeros((2, 2)))
-    top, bottom = overshoots(*both, _PIXELS, jitter(tally), ratio)
+    top, bottom = overshoots(*both, _PIXELS, of_ramps, ratio)
     ramp_s = 0.5 * max(period_s - both[0].ramps.rest_s - both[1].ramps.rest_s, 0.0)
     leaks = top.drift, -bottom.drift * ratio
     ramp_leak_hz = 0.5 * (leaks[0] + leaks[1])
