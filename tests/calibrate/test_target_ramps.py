@@ -40,9 +40,10 @@ def ramp_events(rng, sigma, cutoff_hz, interval_s, pixels, count=9):
     return times[2 : 2 + count]
 
 
-@pytest.mark.parametrize(("sigma", "cutoff_hz"), [(0.02, 8.0), (0.05, 25.0), (0.15, 12.0), (0.08, 150.0), (0.2, 70.0)])
+@pytest.mark.parametrize(("sigma", "cutoff_hz"), [(0.02, 8.0), (0.05, 25.0), (0.15, 12.0), (0.08, 150.0), (0.2, 70.0),
+                                                  (0.1, 400.0), (0.15, 500.0)])  # fmt: skip
 def test_noise_moves_events_of_a_ramp_as_the_law_says(sigma, cutoff_hz):
-    """Intervals of 20 ms: σ p I of 0.03 to 2.7. The median size of D within 8 %, its error is 2.5 %."""
+    """Intervals of 20 ms: σ p I of 0.03 to 15. The median size of D within 8 %, its error is 2.5 %."""
     rng = np.random.default_rng(3)
     times = ramp_events(rng, sigma, cutoff_hz, 0.02, 1600)[3:7]
     log = np.log(np.diff(times[:, np.isfinite(times).all(axis=0)], axis=0))
@@ -91,6 +92,9 @@ def test_the_scatter_of_a_ramp_is_that_of_its_events(is_on, clock_us, bend):
     of_events = of.variance * (of.interval_s / 0.01) ** 2
     assert np.average(of_events, weights=of.error**-2) == pytest.approx(0.94 * 20 * 0.02**2, rel=0.07)
     assert np.all((of.error > 0.002) & (of.error < 0.1))
+    if clock_us > 1:
+        exact = ramps.jitter(kept(np.random.default_rng(2), 0.02, 10_000, is_on=is_on))
+        assert of.variance == pytest.approx(exact.variance, rel=0.01)
 
 
 def test_ramps_of_a_few_events_or_of_another_speed_tell_nothing():
@@ -102,6 +106,8 @@ def test_ramps_of_a_few_events_or_of_another_speed_tell_nothing():
     assert ramps.jitter(kept(rng, 0.05, 10_000, turn=1.1)) is not None
     # steps of the clock that make more than three tenths of the scatter
     assert ramps.jitter(kept(rng, 0.03, 10_000, clock_us=2000)) is None
+    # a variance of 0.2, that of deviates of a tenth, is the largest one that tells
+    assert ramps.jitter(kept(rng, 0.09, 10_000)) is not None and ramps.jitter(kept(rng, 0.12, 10_000)) is None
     without = kept(rng, 0.05, 10_000)
     without.period_s = lambda: None
     assert ramps.jitter(without) is None

@@ -39,6 +39,8 @@ _OF_CLOCK = 0.3
 _SPEED = np.array([0.6, 1.28, 1.92, 3.2, 3.84, 6.4, 9.0, 12.8, 18.0, 25.0])
 _LEFT = np.array([1.0, 0.89, 0.81, 0.735, 0.67, 0.555, 0.5, 0.46, 0.39, 0.35])
 _MOST_NOISE = 0.25
+#: Largest V that tells: events of strong noise leave intervals that count no longer, those with the largest D.
+_MOST_VARIANCE = 0.2
 #: Error of ln V, one for all intervals of both polarities, and what unlike noise in bright and dark light adds to it,
 #: over the logarithm of their variances' ratio.
 _LAW_ERROR, _OF_LIGHT = 0.15, 0.25
@@ -122,7 +124,7 @@ def _by_interval(
         interval_s, whole = float(np.exp(log[mine].mean())), _of_median(size)
         # what steps of the clock add: 20 times the variance of an even law
         of_clock = 20 / 12 * (clock_us * S_PER_US / interval_s) ** 2
-        if of_group.min() > 0 and of_clock < _OF_CLOCK * whole:
+        if of_group.min() > 0 and of_clock < _OF_CLOCK * whole and whole < _MOST_VARIANCE:
             error = float(np.log(of_group).std(ddof=1)) / np.sqrt(GROUPS)
             rows.append((is_on, interval_s, whole - of_clock, error))
     return rows
