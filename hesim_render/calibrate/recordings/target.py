@@ -150,7 +150,8 @@ class _Course(NamedTuple):
 
 def _course(tally: EventTally, leak_hz: float, period_s: float, ratio: float) -> _Course:
     """Overshoots by what comes late at the rests of the light; light without rests turns without any."""
-    both, of_ramps = rests(tally, leak_hz, ratio), jitter(tally)
+    both = rests(tally, leak_hz, ratio)
+    of_ramps = None if both is None else jitter(tally)
     if both is None or (of_ramps is None and not all(rest.late.size for rest in both)):
         none, half = np.zeros(_PIXELS), 0.5 * leak_hz * period_s
         return _Course(none, none, (half, half), UNSURE_LEAK * half, np.zeros((2, 2)))
