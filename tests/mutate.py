@@ -81,6 +81,10 @@ TARGETS: dict[str, tuple[str, ...]] = {
     ),
     "sources.render.glare": ("tests/sources/render/test_lens_effects.py",),
     "core.rng:normal_pair": ("tests/pixels/test_noise_aps.py", "tests/pixels/test_noise_evs.py"),
+    "calibrate.recordings.ramps": ("tests/calibrate/test_target_ramps.py",),
+    "calibrate.recordings.rests": ("tests/calibrate/test_target_rests.py", "tests/calibrate/test_target_ramps.py"),
+    "calibrate.recordings.stillness": ("tests/calibrate/test_still_closed_forms.py",),
+    "measure.event_distance": ("tests/measure/test_event_distance.py",),
 }
 
 

@@ -107,7 +107,7 @@ def _detected(axes: "Axes", figures: EventFigures) -> None:
             axes.errorbar(
                 one.lux, one.share, 1.96 * one.error, color=colour, marker="o", markersize=3.6, linewidth=1, label=name
             )
-    axes.axhline(DETECTED, color=COLOURS[6], linewidth=0.8, linestyle="--")
+    axes.axhline(DETECTED, color=COLOURS[6], linewidth=0.8, linestyle="--", label=f"{DETECTED:g}, of the range")
     logarithmic(axes, "x")
     _legend(axes)
 
@@ -137,7 +137,9 @@ def _band(axes: "Axes", figures: EventFigures) -> None:
     there = np.isfinite(band.swing)
     if there.any():
         axes.plot(band.hz[there], band.swing[there], color=_ON_OFF[0], marker="o", markersize=3.6)
-        axes.axhline(np.sqrt(2) * band.swing[there][0], color=COLOURS[6], linewidth=0.8, linestyle="--")
+        limit = np.sqrt(2) * band.swing[there][0]
+        axes.axhline(limit, color=COLOURS[6], linewidth=0.8, linestyle="--", label="√2 times the first")
+        _legend(axes)
     if band.entry["value"] is not None:
         axes.axvline(band.entry["value"], color=COLOURS[6], linewidth=0.8, linestyle=":")
     logarithmic(axes, "x", "y")

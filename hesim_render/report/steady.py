@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from hesim_render.calibrate.estimate import not_identifiable
-from hesim_render.calibrate.recordings import still
+from hesim_render.calibrate.recordings import still, stillness
 from hesim_render.report.bench import EventBench
 from hesim_render.report.estimates import log_estimated
 
@@ -44,7 +44,7 @@ def background(bench: EventBench) -> list[Background]:
         rates = still.group_rates(tally)
         seconds = tally.pixels * tally.seconds
         entries = _rate(still.rate(rates, 0), seconds), _rate(still.rate(rates, 1), seconds)
-        problem = still.not_still(tally)
+        problem = stillness.not_still(tally)
         outcome.append(
             Background(
                 one.lux, bench.temperature_c(one), tally.seconds, entries, tally.pixels,

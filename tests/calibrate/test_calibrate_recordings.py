@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hesim_render.calibrate.recordings import calibrate_recordings, calibration, short_intervals, still
+from hesim_render.calibrate.recordings import calibrate_recordings, calibration, short_intervals, still, stillness
 from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
 from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, tally
@@ -502,6 +502,20 @@ def test_a_scene_that_is_not_still_is_a_finding(tmp_path):
     assert "the scene moves" in found["findings"][0]["text"]
 
 
+def test_a_scene_that_moves_at_a_steady_rate_is_a_finding_and_tells_no_leak():
+    """Each pixel of the upper half has its events early, each of the lower one late, as those of swaying plants."""
+    rng = np.random.default_rng(12)
+    shape = (48, 32)
+    events = random_events(rng, np.full(48 * 32, 8.0), 0.0, seconds=1.0, shape=shape)
+    still_one = tally(EventStream.of(events, shape))
+    assert stillness.not_still(still_one) is None
+    upper, early = events["y"] < 24, events["t_us"] < 500_000
+    moving = tally(EventStream.of(events[(upper == early) | (rng.random(events.size) < 0.3)], shape))
+    found = calibration.figures([moving], None, (5.0,), None, None)
+    assert "something in the scene moves" in found["findings"][0]["text"]
+    assert "its rate changes (findings)" in found["recordings"][0]["leak_rate_hz"]["reason"]
+
+
 def test_a_camera_that_has_not_settled_spoils_no_leak():
     """A burst of OFF events at the begin of one of three recordings: the others tell what they told without it."""
     truth, events, moving = sensor(4)
@@ -531,7 +545,7 @@ def test_few_events_of_a_still_scene_are_no_finding():
     for count in range(3, 43):
         events = random_events(rng, np.full(PIXELS, count / PIXELS / 0.5), 0.0, seconds=0.5, shape=SHAPE)
         if events.size > 1:
-            assert still.not_still(tally(EventStream.of(events, SHAPE))) is None, count
+            assert stillness.not_still(tally(EventStream.of(events, SHAPE))) is None, count
 
 
 def test_bad_input_is_one_clear_error(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from hesim_render.calibrate.estimate import estimated
-from hesim_render.calibrate.recordings import calibration, short_intervals, still, target
+from hesim_render.calibrate.recordings import calibration, short_intervals, still, stillness, target
 from hesim_render.calibrate.recordings import tally as recording_tally
 from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import readout_limit
@@ -194,26 +194,26 @@ def slices_tally(per_slice):
     slices = np.zeros((2, SLICES, GROUPS))
     slices[0, :, 3], slices[1, :, 5] = np.asarray(per_slice) * 0.75, np.asarray(per_slice) * 0.25
     return SimpleNamespace(slices=slices, pixels=PIXELS, seconds=2.0, waves=np.zeros((2, SLICES)),
-                           period_s=lambda: None)  # fmt: skip
+                           period_s=lambda: None, shape=(1, PIXELS), counts=np.zeros((2, 2, PIXELS)))  # fmt: skip
 
 
 def test_a_scene_is_not_still_beyond_half_of_its_rate_or_a_burst():
     even = np.full(20, 4000.0)
-    assert still.not_still(slices_tally(even)) is None
+    assert stillness.not_still(slices_tally(even)) is None
     steps = even.copy()
     steps[:5], steps[-5:] = 4000 * 0.755, 4000 * 1.245  # a difference of 0.49 of the mean
-    assert still.not_still(slices_tally(steps)) is None
+    assert stillness.not_still(slices_tally(steps)) is None
     steps[:5], steps[-5:] = 4000 * 0.745, 4000 * 1.255
-    told = still.not_still(slices_tally(steps))
+    told = stillness.not_still(slices_tally(steps))
     # 2980 and 5020 events of 40 pixels in 0.1 s
     assert "its rate goes from 745 to 1255 Hz a pixel, at most 1255" in told
-    assert "its rate goes from 1255 to 745" in still.not_still(slices_tally(steps[::-1]))
+    assert "its rate goes from 1255 to 745" in stillness.not_still(slices_tally(steps[::-1]))
     for factor, is_told in ((0.99, False), (1.03, True)):
         burst = np.full(20, 400.0)
         # c of 19 · 400 + c is beyond the tail of three times the mean at c ≈ 1530
         high = next(c for c in range(400, 4000, 4) if c > stats.poisson.isf(1e-3 / 20, 3 * (19 * 400 + c) / 20))
         burst[9] = 4 * round(factor * high / 4)
-        assert (still.not_still(slices_tally(burst)) is not None) is is_told
+        assert (stillness.not_still(slices_tally(burst)) is not None) is is_told
 
 
 @pytest.mark.parametrize(("turns", "period", "lamp", "is_seen"), [
@@ -221,12 +221,50 @@ def test_a_scene_is_not_still_beyond_half_of_its_rate_or_a_burst():
     ((200, 100), 0.01, "a lamp", False),
 ])  # fmt: skip
 def test_pixels_that_see_a_steady_change_are_of_no_still_scene(monkeypatch, turns, period, lamp, is_seen):
-    monkeypatch.setattr(still, "of_a_lamp", lambda tally: lamp)
+    monkeypatch.setattr(stillness, "of_a_lamp", lambda tally: lamp)
     one = slices_tally(np.full(20, 4000.0))
     one.period_s, one.turns_us = lambda: period, [np.ones(count) for count in turns]
-    assert (still.moving(one) is not None) is is_seen
-    told = still.not_still(one)
+    assert (stillness.moving(one) is not None) is is_seen
+    told = stillness.not_still(one)
     assert told == lamp if not is_seen else "turn from OFF to ON events every 0.83 s" in told
+
+
+@pytest.mark.parametrize(("events", "part", "squares", "others", "is_seen"), [
+    (800, 0.26, 4, 3000, True), (800, 0.24, 4, 3000, False), (800, 0.26, 3, 3000, False), (800, 0.26, 4, 9900, False),
+    (800, 0.26, 4, 9300, True), (100, 0.59, 4, 0, False), (100, 0.61, 4, 0, True),
+])  # fmt: skip
+def test_squares_whose_rate_changes_are_of_a_scene_that_moves(events, part, squares, others, is_seen):
+    """Difference over sum of their events beyond a quarter and six errors of counting; four squares of a quarter."""
+    halves = np.zeros((2, 40, 30))  # 3 rows and 2 columns of squares, some of them cut
+    begins = [(0, 0), (16, 16), (32, 0), (32, 17)][:squares]
+    for k, (row, col) in enumerate(begins):
+        more, less = events * (1 + part) / 2, events * (1 - part) / 2
+        halves[:, row : row + 4, col : col + 4] += (np.array([more, less]) / 16)[:: 1 if k % 2 else -1, None, None]
+    halves[:, 20, 3] += others / 2
+    one = SimpleNamespace(shape=(40, 30), counts=np.stack([0.3 * halves, 0.7 * halves]).reshape(2, 2, -1))
+    told = stillness.wandering(one)
+    assert (told is not None) is is_seen
+    if is_seen and others == 3000:
+        assert "52 % of its events are in 4 squares of 16x16 px" in told
+
+
+def test_one_recording_tells_how_many_pixels_outdo_their_neighbours():
+    """More than ten times the ON events of each of the eight beside it, and ten at least; borders have fewer."""
+    on = np.zeros((6, 7), int)
+    on[0, 0], on[0, 6], on[3, 3], on[3, 4], on[5, 3], on[4, 5] = 10, 9, 200, 19, 11, 1
+    one = SimpleNamespace(shape=(6, 7), per_pixel=lambda: np.stack([on.ravel(), 500 * np.ones(42, int)]))
+    assert "; 3 pixels have more than ten times" in still.hot_share([one])["reason"]
+    on[3, 4] = 20
+    assert "; 2 pixels have more than ten times" in still.hot_share([one])["reason"]
+
+
+def test_any_change_but_that_of_a_lamp_takes_a_scene_out_of_balance(monkeypatch):
+    names = ("unsteady", "moving", "wandering", "of_a_lamp")
+    for changing in (*names, None):
+        for name in names:
+            monkeypatch.setattr(stillness, name, lambda tally, is_it=name == changing: "why" if is_it else None)
+        assert stillness.changes(None) is (changing in names[:3])
+        assert stillness.not_still(None) == ("why" if changing else None)
 
 
 def test_on_events_of_one_phase_are_those_of_a_lamp():
@@ -235,8 +273,8 @@ def test_on_events_of_one_phase_are_those_of_a_lamp():
         one = slices_tally(np.full(20, each / 0.75))
         one.waves = np.zeros((2, SLICES), complex)
         one.waves[1] = np.sqrt(depth**2 * each**2 + each) * np.exp(1j * np.arange(SLICES))
-        assert (still.not_still(one) is not None) is is_seen, (depth, each)
-    assert "a lamp of 120 Hz (the sum of their phases is 20 % of" in still.of_a_lamp(one)
+        assert (stillness.not_still(one) is not None) is is_seen, (depth, each)
+    assert "a lamp of 120 Hz (the sum of their phases is 20 % of" in stillness.of_a_lamp(one)
 
 
 def rates_of(rng, lux, ratio, dark, growth, scatter=0.0):
@@ -637,17 +675,17 @@ def test_windows_that_hold_whole_events_of_every_pixel_tell_no_limit(pixels, is_
 ])  # fmt: skip
 def test_a_rate_that_doubles_is_unsteady_beyond_four_errors_of_counting(events, pixels, is_unsteady):
     """In both polarities together, whatever the rate of a pixel is; the last quarter has twice the first."""
-    course = events * np.linspace(0.62, 1.38, still.SLICES)
+    course = events * np.linspace(0.62, 1.38, SLICES)
     tally = SimpleNamespace(slices=np.stack([0.7 * course, 0.3 * course])[..., None], pixels=pixels, seconds=8.0)
-    found = still.unsteady(tally)
+    found = stillness.unsteady(tally)
     assert (found is not None) == is_unsteady
     if is_unsteady:
-        rate = course / (pixels * 8.0 / still.SLICES)
-        quarter = still.SLICES // 4
+        rate = course / (pixels * 8.0 / SLICES)
+        quarter = SLICES // 4
         early, late = rate[:quarter].mean(), rate[-quarter:].mean()
         assert f"from {early:.4g} to {late:.4g} Hz a pixel, at most {rate.max():.4g}" in found
     tally.slices[:] = events / 2
-    assert still.unsteady(tally) is None
+    assert stillness.unsteady(tally) is None
 
 
 def test_the_error_of_a_leak_without_a_ratio_has_the_scatter_of_the_difference():
@@ -675,7 +713,7 @@ def test_a_lamp_is_told_from_slices_of_two_of_its_periods(periods):
     slices[0] = 50
     on = slices[0].sum(axis=1)
     waves = on * np.exp(0.4j) * np.array([[lamp == min(LAMPS_HZ)] for lamp in LAMPS_HZ])
-    told = still.of_a_lamp(SimpleNamespace(slices=slices, seconds=seconds, waves=waves))
+    told = stillness.of_a_lamp(SimpleNamespace(slices=slices, seconds=seconds, waves=waves))
     assert (told is not None) == (periods > 2)
     if told is not None:
         assert f"a lamp of {min(LAMPS_HZ):g} Hz" in told

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hesim_render.calibrate.estimate import not_identifiable
-from hesim_render.calibrate.recordings import still, target
+from hesim_render.calibrate.recordings import still, stillness, target
 from hesim_render.calibrate.recordings.noise_spread import noise_spread, surest
 from hesim_render.calibrate.recordings.rate_spread import rate_spread, regularity
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
@@ -132,7 +132,7 @@ def figures(
             one.used &= ~hot
     of_target = target.unknown("it takes a recording of a moving target (--target)")
     # levels are balanced where the light and the camera are steady
-    steady = [k for k, one in enumerate(tallies) if not (still.unsteady(one) or still.moving(one))]
+    steady = [k for k, one in enumerate(tallies) if not stillness.changes(one)]
     calm, calm_lux = [tallies[k] for k in steady], None if lux is None else [lux[k] for k in steady]
     result = still.balance(calm, calm_lux)
     if moving is not None and contrast is not None:
@@ -156,7 +156,7 @@ def figures(
             "on_rate_spread_rel": rate_spread(one, 0), "off_rate_spread_rel": rate_spread(one, 1),
             "on_local_variation": regularity(one), "leak_rate_hz": leaks.get(k, changes),
         })  # fmt: skip
-        if problem := still.not_still(one):
+        if problem := stillness.not_still(one):
             findings.append({"file": Path(one.source).name, "text": problem})
     return {
         "sensor": {
@@ -173,7 +173,7 @@ def _dead_time(tallies: Sequence[EventTally], moving: EventTally | None) -> dict
     """Dead time from the still scenes, whose noise comes at any time. A target that moves has a shortest time between
     two events of its own, which the dead time does not exceed.
     """
-    steady = [one for one in tallies if still.of_a_lamp(one) is None]
+    steady = [one for one in tallies if stillness.of_a_lamp(one) is None]
     if not steady:
         return not_identifiable("the lamp flickers in every recording, which gives the intervals steps of its own")
     own = dead_time(steady)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from hesim_render.calibrate.recordings.ramps import Jitter, likelihoods
 from hesim_render.calibrate.recordings.tally import STEPS_PER_OCTAVE, EventTally
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.evs.formulas import POLE
@@ -25,7 +26,7 @@ from hesim_render.pixels.evs.formulas import POLE
 #: Levels over σ at which the law of the highest level is known.
 _LEVELS = np.linspace(-5.0, 8.0, 131)
 #: Noise over the threshold, and corners of the noise in Hz, among which the likelihood decides.
-_NOISE, _CUTOFF_HZ = np.geomspace(2e-3, 0.7, 40), np.geomspace(20.0, 2000.0, 20)
+_NOISE, _CUTOFF_HZ = np.geomspace(2e-3, 0.7, 60), np.geomspace(20.0, 2000.0, 33)
 #: Leak at a rest over that of the still scenes, whose light may be another, and the deviation of its logarithm.
 _LEAK, _LEAK_DEVIATION = np.array([0.4, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0]), 0.6
 #: Relative error of the law of late events.
@@ -40,6 +41,10 @@ _LATEST = 0.05
 #: Late events in the first factor of two over those of the second, above which those of ramps are among them. Chosen on
 #: stars and checkerboards written in NumPy, judged on those of the tests, which have seeds of their own.
 _OF_RAMPS = 2.0
+#: Late events of light that comes to its rest slowly, as behind a lens: parts of the first count that may be of it, by
+#: what they fall from one factor of two of the time to the next. That there are none is taken to be as likely as all of
+#: these together. Chosen on targets with a blur that is a Gaussian, judged on others.
+_OF_TAIL, _TAIL_FALLS = np.arange(0.1, 0.95, 0.1), (2.0, 4.0)
 #: A rest shorter than this part of the period is none.
 _LEAST_REST = 0.1
 #: Gaps above the median differ by this much at most, where all pixels see the same rests.
@@ -79,7 +84,7 @@ class Rest(NamedTuple):
     Parameters
     ----------
     ramps : of it.
-    edges_s : times since its begin between which late events are counted.
+    edges_s : times since its begin between which late events are counted; its end alone where none can be.
     late, of : late events between these times, and all visits of pixels.
     scatter : variance of late events over groups of pixels, over their mean; 1 at least.
     is_noisy : noise brings events back at this rest.
@@ -165,6 +170,8 @@ def quantile_us(counts: NDArray, part: float = 0.5) -> float:
 def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] | None:
     """The rests at the top and at the bottom of the light; None where it has none, or not the same for all pixels.
 
+    A rest that is too short for late events has none of them, in no time.
+
     Parameters
     ----------
     tally : of the target.
@@ -190,8 +197,11 @@ def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] 
         first_s = max(_EARLY * rest_s, _INTERVALS * max(up_s, down_s), _later_s(tally, k))
         octaves = np.arange(np.floor(np.log2(rest_s / first_s)), -1, -1)
         edges_s = np.asarray(rest_s / 2.0**octaves, np.float64)
-        if edges_s.size < 2:
-            return None
+        drift = leak_hz if k == 0 else -leak_hz / ratio
+        ramps = Ramps((1 / up_s, own / down_s), drift, rest_s)
+        if edges_s.size < 2:  # too short beside the intervals of the ramp
+            result.append(Rest(ramps, np.array([rest_s]), np.empty(0), float(whole.sum()), 1.0, False))
+            continue
         # times before the fall, as edges of the histogram; a late event is at its level, so that a threshold of the
         # other polarity lies between it and the first event of the fall
         end_s = rest_s + down_s
@@ -206,9 +216,6 @@ def rests(tally: EventTally, leak_hz: float, ratio: float) -> tuple[Rest, Rest] 
             edges_s, late = edges_s[1:], late[:, 1:]
         each = late.sum(axis=1)
         scatter = each.var(ddof=1) / each.mean() if each.mean() > 1 else 1.0
-        drift = leak_hz if k == 0 else -leak_hz / ratio
-        slopes = 1 / up_s, own / down_s
-        ramps = Ramps(slopes, drift, rest_s)
         # noise makes as many late events in each factor of two of the time, the leak as many in each second
         by_leak = _LEAK[-1] * max(drift, 0.0) * np.diff(edges_s) * whole.sum()
         before, last = (late.sum(axis=0) - by_leak)[-2:] if edges_s.size > 2 else (np.inf, 0.0)
@@ -231,7 +238,9 @@ def _leaks(rest: Rest) -> NDArray[np.float64]:
     return np.ones(1) if rest.ramps.drift == 0 else _LEAK
 
 
-def overshoots(top: Rest, bottom: Rest, places: int) -> tuple[Overshoot, Overshoot]:
+def overshoots(
+    top: Rest, bottom: Rest, places: int, of_ramps: Jitter | None = None, ratio: float = 1.0
+) -> tuple[Overshoot, Overshoot]:
     """Highest levels at both rests, by the posterior of their noise and of their common bandwidth.
 
     The priors of the logarithms are flat, but for the leak. Late events scatter more than at random, as the same pixels
@@ -241,14 +250,16 @@ def overshoots(top: Rest, bottom: Rest, places: int) -> tuple[Overshoot, Oversho
     ----------
     top, bottom : rests.
     places : of the quantiles of the law.
+    of_ramps : scatter of the events in the ramps, which has the bandwidth in it; None: late events alone.
+    ratio : θ₋/θ₊.
     """
     parts = [_posterior(rest) for rest in (top, bottom)]
-    of_cutoff = [special.logsumexp(log, axis=(0, 2)) for log, _ in parts]
-    both = np.sum(of_cutoff, axis=0)
-    both = np.exp(both - special.logsumexp(both))
+    late = [special.logsumexp(log, axis=0) for log, _ in parts]
+    others = likelihoods(late[0], late[1], _NOISE, _CUTOFF_HZ, of_ramps, ratio)
     result = []
-    for rest, (log, mean), own in zip((top, bottom), parts, of_cutoff, strict=True):
-        weight = np.exp(log - own[:, None]) * both[:, None]  # [leak, cut-off, noise]
+    for rest, (log, mean), other in zip((top, bottom), parts, others, strict=True):
+        weight = log + other  # [leak, cut-off, noise]
+        weight = np.exp(weight - special.logsumexp(weight))
         order = np.argsort(mean, axis=None)
         below = np.cumsum(weight.ravel()[order])
         low, value, high = (float(v) for v in np.interp([0.025, 0.5, 0.975], below, mean.ravel()[order]))
@@ -293,4 +304,13 @@ def _posterior(rest: Rest) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     own = -0.5 * (np.log(_leaks(rest)) / _LEAK_DEVIATION)[:, None, None] ** 2
     if rest.is_noisy:
         return own + log_chance(rest.late.sum(keepdims=True), expected.sum(axis=-1, keepdims=True)), mean
-    return own + log_chance(rest.late, expected), mean
+    tails = _tails(rest.late) if rest.late.size else []
+    chances = [log_chance(rest.late, expected)]
+    chances += [log_chance(rest.late, expected + tail) - np.log(len(tails)) for tail in tails]
+    return own + special.logsumexp(chances, axis=0), mean
+
+
+def _tails(late: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Late events of light that comes to its rest slowly, as they may be among these, each [time]."""
+    steps = np.arange(late.size)
+    return [part * late[0] * falls**-steps for falls in _TAIL_FALLS for part in _OF_TAIL]

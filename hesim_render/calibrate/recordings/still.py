@@ -12,23 +12,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.ndimage import maximum_filter
 
 from hesim_render.calibrate.estimate import estimated, not_identifiable
-from hesim_render.calibrate.recordings.tally import GROUPS, LAMPS_HZ, SLICES, EventTally
+from hesim_render.calibrate.recordings.tally import GROUPS, EventTally
 
 #: Events of a pixel, as the median, with which a silent pixel is not silent by chance.
 _EVENTS_TO_BE_SILENT = 30
 #: A hot pixel has more ON events than a pixel of so many times the rate of the others, but with this chance, in each
 #: recording.
 _HOT, _HOT_CHANCE = 10.0, 1e-3
-#: Chance of a slice of three times the mean rate that counts as one of such a rate.
-_BURST_CHANCE = 1e-3
-#: Part of the ON events that have one phase of a lamp, and their power over that of chance, from which it flickers.
-_LEAST_FLICKER, _FLICKER_POWER = 0.1, 4.0
-#: Periods of a lamp in a slice of a recording that tells it.
-_LEAST_PERIODS = 2.0
-#: Turns from OFF to ON events that tell a period.
-_FEWEST_TURNS = 300
+#: Fewest ON events of a pixel that is alone in having them.
+_LONELY = 10
 #: Relative standard deviation of thresholds over pixels, where none was measured.
 USUAL_MISMATCH = 0.1
 #: Shift of ρ, and of a leak over ρ n₋, in squares of the mismatch.
@@ -254,9 +249,20 @@ def hot_pixels(tallies: Sequence[EventTally]) -> NDArray[np.bool_]:
 def hot_share(tallies: Sequence[EventTally]) -> dict[str, Any]:
     """Part of the pixels with many more ON events than the others, in each recording."""
     if len(tallies) < 2:
-        return not_identifiable("it takes two recordings: in one, a pixel that sees a change looks like a hot one")
+        return not_identifiable(
+            "it takes two recordings: in one, a pixel that sees a change looks like a hot one; "
+            f"{_lonely(tallies[0])} pixels have more than ten times the ON events of each pixel beside them"
+        )
     hot = hot_pixels(tallies)
     return share(int(np.count_nonzero(hot)), hot.size)
+
+
+def _lonely(tally: EventTally) -> int:
+    """Pixels of ten ON events or more that have more than `_HOT` times those of each of their neighbours."""
+    on = tally.per_pixel()[0].reshape(tally.shape)
+    beside = np.ones((3, 3), np.bool_)
+    beside[1, 1] = False
+    return int(np.count_nonzero((on >= _LONELY) & (on > _HOT * maximum_filter(on, footprint=beside, mode="constant"))))
 
 
 def silent_share(tallies: Sequence[EventTally]) -> dict[str, Any]:
@@ -269,66 +275,3 @@ def silent_share(tallies: Sequence[EventTally]) -> dict[str, Any]:
             f"{_EVENTS_TO_BE_SILENT} are needed: record longer"
         )
     return share(int(np.count_nonzero(total == 0)), total.size)
-
-
-def unsteady(tally: EventTally) -> str | None:
-    """A line that says that the rate of a recording changes; None where it is steady enough.
-
-    The last quarter of the slices against the first, and the largest against the mean, each beyond what counting does.
-    """
-    count = tally.slices.sum(axis=(0, 2))
-    if count.sum() == 0:
-        return None
-    # rate of each slice of time, Hz a pixel
-    each = count / (tally.pixels * tally.seconds / SLICES)
-    mean = each.mean()
-    early, late = each[: SLICES // 4].mean(), each[-SLICES // 4 :].mean()
-    error = max(each.std(ddof=1), np.sqrt(2 / count.mean()) * mean) / np.sqrt(SLICES / 4)
-    burst = count.max() > stats.poisson.isf(_BURST_CHANCE / SLICES, 3 * count.mean())
-    if abs(late - early) > max(0.5 * mean, 4 * error) or burst:
-        return (
-            f"its rate goes from {early:.4g} to {late:.4g} Hz a pixel, at most {each.max():.4g}: the scene moves, the "
-            "lamp flickers, or the camera was not settled"
-        )
-    return None
-
-
-def not_still(tally: EventTally) -> str | None:
-    """A line that says that a recording is not one of a still scene in steady light; None where it may be."""
-    return unsteady(tally) or of_a_lamp(tally) or moving(tally)
-
-
-def moving(tally: EventTally) -> str | None:
-    """A line that says that the pixels see their light change again and again, at a steady rate; None where they do
-    not, or a lamp does it.
-    """
-    period_s = tally.period_s()
-    if period_s is None or sum(one.size for one in tally.turns_us) < _FEWEST_TURNS or of_a_lamp(tally) is not None:
-        return None
-    return (
-        f"most of its pixels turn from OFF to ON events every {period_s:.3g} s: a target that moves by, or light that "
-        "changes; a target is given by --target"
-    )
-
-
-def of_a_lamp(tally: EventTally) -> str | None:
-    """A line that says that the ON events follow alternating current; None where chance makes as much of it.
-
-    Of independent events at any time, the squared length of their sum of phases over their number has mean 1.
-    """
-    on = tally.slices[0].sum(axis=1).astype(np.float64)
-    if on.min() == 0 or tally.seconds / SLICES < _LEAST_PERIODS / min(LAMPS_HZ):
-        return None
-    # a slice that is no whole number of periods has a sum of its own
-    turns = np.outer(LAMPS_HZ, np.linspace(0.0, tally.seconds, SLICES + 1))
-    even = np.diff(np.exp(2j * np.pi * turns), axis=1) / (2j * np.pi * np.diff(turns, axis=1))
-    squares = np.abs(tally.waves - on * even) ** 2
-    depth = np.sqrt(np.maximum(np.mean((squares - on) / on**2, axis=1), 0.0))
-    power = np.mean(squares / on, axis=1)
-    k = int(np.argmax(depth))
-    if depth[k] < _LEAST_FLICKER or power[k] < _FLICKER_POWER:
-        return None
-    return (
-        f"its ON events come with a lamp of {LAMPS_HZ[k]:g} Hz (the sum of their phases is {100 * depth[k]:.2g} % of "
-        "that of equal ones): the lamp flickers; take one on direct current, or daylight"
-    )

@@ -22,6 +22,8 @@ STEPS_PER_OCTAVE, STEPS = 32, 32 * 26
 LAMPS_HZ = (100.0, 120.0)
 #: Times between turns that are kept, and part of them near their median where they are those of one period.
 TURNS, _ONE_PERIOD = 200_000, 0.6
+#: Pixels whose events are kept, of the sensor's, and most events of them.
+_KEPT_PIXELS, _KEPT = 4096, 2_000_000
 #: A recording needs this much time for figures of the scatter between its parts, µs.
 _LEAST_US = 10 * SLICES
 
@@ -35,7 +37,7 @@ class EventTally:
     source : name of the recording, for errors.
     shape : rows and columns, px.
     begin_us, end_us : time of the recording, µs.
-    only : [pixel], pixels whose `same`, `gaps` and `turns_us` count; None: all.
+    only : [pixel], pixels whose `same`, `gaps`, `turns_us` and `kept` events count; None: all.
 
     Attributes
     ----------
@@ -79,6 +81,10 @@ class EventTally:
         self.same, self.gaps = np.zeros((2, 2, GROUPS, STEPS), np.int64)
         self.gap_us = np.zeros((2, pixels), np.int64)
         self.turns_us, self._turns, self._turn_us = [], 0, np.full(pixels, -1, np.int64)
+        among = np.arange(pixels) if self.only is None else np.flatnonzero(self.only)
+        self._is_kept, self._kept_size = np.zeros(pixels, np.bool_), 0
+        self._kept: list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]] = []
+        self._is_kept[np.random.default_rng(1).permutation(among)[:_KEPT_PIXELS]] = True
         # group of each pixel: neighbours and columns are spread over all groups
         self.group = (np.arange(pixels, dtype=np.uint64) * np.uint64(2654435761) >> np.uint64(16)) % np.uint64(GROUPS)
         self._last_us, self._last_on = np.full((2, pixels), -1, np.int64), np.zeros(pixels, np.bool_)
@@ -117,6 +123,7 @@ class EventTally:
             np.maximum.at(self.gap_us[k], pixel[is_turn], (t_us - before_us)[is_turn])
         if self.only is not None:
             known = known & self.only[pixel]
+        self._keep(pixel, t_us, on)
         self._successions(known, was_on, on, pixel, t_us - before_us)
         turn = known & on & ~was_on
         self._take_turns(pixel[turn], t_us[turn])
@@ -162,6 +169,20 @@ class EventTally:
         result = (t_us - before_us)[before_us >= 0]
         self.turns_us.append(result)
         self._turns += result.size
+
+    def _keep(self, pixel: NDArray[np.int64], t_us: NDArray[np.int64], on: NDArray[np.bool_]) -> None:
+        if self._kept_size < _KEPT:
+            own = self._is_kept[pixel]
+            self._kept.append((pixel[own], t_us[own], on[own]))
+            self._kept_size += int(np.count_nonzero(own))
+
+    def kept(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        """Pixel, time in µs and polarity of the first events of some of the pixels, by pixel and time."""
+        if not self._kept:
+            return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.bool_)
+        pixel, t_us, on = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
+        order = np.argsort(pixel, kind="stable")
+        return pixel[order], t_us[order], on[order]
 
     def period_s(self) -> float | None:
         """Time between two turns of a pixel from OFF to ON events, s; those that noise splits or joins are left out.

@@ -17,6 +17,7 @@ from scipy import special
 from scipy.ndimage import uniform_filter
 
 from hesim_render.calibrate.estimate import Z_95, estimated, not_identifiable
+from hesim_render.calibrate.recordings.ramps import jitter
 from hesim_render.calibrate.recordings.rests import overshoots, quantile_us, rests
 from hesim_render.calibrate.recordings.still import UNSURE_LEAK, jackknife
 from hesim_render.calibrate.recordings.tally import GROUPS, EventTally
@@ -150,10 +151,11 @@ class _Course(NamedTuple):
 def _course(tally: EventTally, leak_hz: float, period_s: float, ratio: float) -> _Course:
     """Overshoots by what comes late at the rests of the light; light without rests turns without any."""
     both = rests(tally, leak_hz, ratio)
-    if both is None:
+    of_ramps = None if both is None else jitter(tally)
+    if both is None or (of_ramps is None and not all(rest.late.size for rest in both)):
         none, half = np.zeros(_PIXELS), 0.5 * leak_hz * period_s
         return _Course(none, none, (half, half), UNSURE_LEAK * half, np.zeros((2, 2)))
-    top, bottom = overshoots(*both, _PIXELS)
+    top, bottom = overshoots(*both, _PIXELS, of_ramps, ratio)
     ramp_s = 0.5 * max(period_s - both[0].ramps.rest_s - both[1].ramps.rest_s, 0.0)
     leaks = top.drift, -bottom.drift * ratio
     ramp_leak_hz = 0.5 * (leaks[0] + leaks[1])

@@ -71,7 +71,8 @@ def _variance_panels(section: dict[str, Any], pooled: NDArray) -> list[str]:
             here = pooled[(pooled[:, 0] == i) & (pooled[:, 1] == j)]
             if len(here) and any(b is not None for b in cell):
                 beta = np.array([0.0 if b is None else b for b in cell])
-                figures.append(_variance_panel(f"({i}, {j})", beta, here))
+                is_one = len(section["beta"]) == len(row) == 1
+                figures.append(_variance_panel("Variance" if is_one else f"Variance, ({i}, {j})", beta, here))
     return figures
 
 
