@@ -35,8 +35,8 @@ ROWS = {
     "box*": ("cornell-box", "davis346", 0.02, False),
     "glass": ("glass-and-metal", "davis346", 0.02, False),
     **{
-        f"{name}*": (str(SCENES / f"{name}.yaml"), "davis346", 0.02, True)
-        for name in ("room", "floor-ball", "sky-knot", "copper", "glass-ball")
+        name: (str(SCENES / f"{name.strip('*')}.yaml"), "davis346", 0.02, True)
+        for name in ("room", "floor-ball", "sky-knot*", "copper*", "glass-ball*")
     },
 }
 

@@ -31,7 +31,7 @@ def render_lines(render: dict[str, Any] | None) -> list[str]:
             # a still scene is judged by values that serve frames and events alike, also where there are no frames
             of = f", {name}" if render["error_noise"].get(name) is not None else ""
             lines.append(
-                f"audit{of}: true deviation rms {_short(part['deviation_noise']['rms'])}; "
+                f"audit{of}: true deviation {_deviation(part)}; "
                 f"{_percent(part['off'])} of values are off by more than {audit['tolerance_noise']:g} times the noise "
                 f"(with 99 % confidence at most {_percent(part['off_at_most'])}){_events(part)}"
             )
@@ -70,6 +70,13 @@ def verdict_lines(audits: Mapping[str, dict[str, Any] | None], noun: str) -> lis
             "speaks against it"
         )
     return lines
+
+
+def _deviation(part: dict[str, Any]) -> str:
+    """Text about the deviation that was judged: of event pixels that of changes, beside that of their level."""
+    rms = _short(part["deviation_noise"]["rms"])
+    level = part.get("level_deviation")
+    return f"rms {rms}" if level is None else f"of changes rms {rms}, of levels {_percent(level['rms'])}"
 
 
 def _events(part: dict[str, Any]) -> str:
