@@ -333,7 +333,8 @@ def test_a_run_that_is_not_what_was_asked_for_says_so_and_has_a_status_of_its_ow
     from hesim_render.sources.render.audit import audit
 
     given = ("simulate", "rotating-star", "--sensor", "reference-mono", "--roi", "24x16", "--duration", 0.01)
-    for tolerance, rays, wanted in ((2.0, 500_000, 3), (audit.TOLERANCE, audit._RAYS, 0)):
+    monkeypatch.setattr(audit, "FINEST_QUALITY", 0.1)  # a quality is named, not that none would do
+    for tolerance, rays, wanted in ((1.0, 500_000, 3), (audit.TOLERANCE, audit._RAYS, 0)):
         monkeypatch.setattr(audit, "TOLERANCE", tolerance)
         monkeypatch.setattr(audit, "_RAYS", rays)  # what can never be shown is not tried for long
         out = tmp_path / str(wanted)

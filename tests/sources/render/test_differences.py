@@ -21,14 +21,12 @@ from hesim_render.sources.render.change_driven.neighbours import Lattice, Sites
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, PilotRays, not_negative
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.pilot import Anchored, Change, Pilot, Refinement, take_pilot
-from hesim_render.sources.render.change_driven.tuning import TUNING as DEFAULT
+from hesim_render.sources.render.change_driven.tuning import TUNING
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.exact import used_responses
 from hesim_render.sources.render.transport import outlines
 
 UNIT, QUALITY = 40.0, 0.6
-#: A part of the wanted error that is not 1.
-TUNING = replace(DEFAULT, difference_part=0.5)
 WANTED = TUNING.difference_part * QUALITY * UNIT
 CENTRE = 5 * 11 + 5
 

@@ -120,10 +120,8 @@ class Tuning:
         rays see none either.
     difference_gain : factor, C. A pair is rendered as a difference where that takes this many times fewer rays. Without
         (1): windows to compare with are rendered for little.
-    difference_part : wanted errors, F. Wanted error of a difference; that of the other window comes on top, but cancels
-        where an event pixel compares both. Chosen on the star and on `benchmarks/scenes/room` and `floor-ball`, judged
-        on `pendulum`. Without (1): changes of bounced light are off by a fifth more. Half as large: a tenth more rays
-        make no error smaller.
+    difference_part : wanted errors, C. Wanted error of a difference; that of the other window comes on top. Without
+        (1): the error of the pair is larger than wanted.
     difference_factor : factor, F. From the star alone, windows 4 to 60 ms apart: the standard error of a difference of
         n rays is this times their scatter over √n, because few rays change, and strata gain little. Without (0.5):
         differences are off by twice what they should.
@@ -186,7 +184,7 @@ class Tuning:
     flat_part: float = 1 / 8
     least_difference_rays: int = 64
     difference_gain: float = 4.0
-    difference_part: float = 0.7
+    difference_part: float = 0.5
     difference_factor: float = 0.95
     unseen_change: float = 0.5
     audit_pilot_rays: int = 64
