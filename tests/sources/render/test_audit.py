@@ -800,10 +800,12 @@ def test_changes_of_asynchronous_pixels_are_counted_from_the_first_window_of_the
     noise = SimpleNamespace(spec=SimpleNamespace(reference="last_event"))
     audit = Audit(noted, source, QUALITY, noise, pixels, 3)
     units = begins[9000.0]
-    flux, spread, known = audit._earlier(units, np.zeros(units.flux.shape))
+    rough = replace(units, base_difference=0.2 * units.base_flux)
+    flux, spread, known = audit._earlier(rough, np.zeros(units.flux.shape))
     np.testing.assert_array_equal(flux, units.base_flux)
+    np.testing.assert_array_equal(spread, rough.base_difference)
     np.testing.assert_array_equal(known[0], truth[4, units.pixel])
-    assert source.rays_traced == units.pixel.size and not spread.any()
+    assert source.rays_traced == units.pixel.size
     # a sensor with a tick compares with the window before the judged one
     noise.spec.reference = "previous_sample"
     reference = units.flux + np.arange(units.flux.shape[0])[:, None]
