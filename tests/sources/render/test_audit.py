@@ -1,6 +1,7 @@
 """The audit's bounds: coverage where misses come in clusters, in calm and in busy places; and what it counts."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.stats import norm
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
+from hesim_render.describe import event_curves
 from hesim_render.mosaic.schedule import Block, tick_blocks
 from hesim_render.sources.protocol import Sample
 from hesim_render.sources.render.audit import audit as audit_module
@@ -823,3 +825,21 @@ def test_frames_have_no_earlier_window():
     (units,) = noted.frames
     np.testing.assert_array_equal(units.base_flux, units.flux)
     np.testing.assert_array_equal(units.base_end_us, units.end_us)
+
+
+def test_background_events_follow_the_light_less_than_the_level_may_be_off():
+    """The reason for `LEVEL_TOLERANCE`, of all shipped sensors: change of the rate's logarithm over that of the light.
+    Without a leak the rate has no floor; where it is a tenth a second or more, it changes by eight times at most.
+    """
+    lux, seen = np.geomspace(1, 10_000, 25), {}
+    for file in (Path(hr.__file__).parents[1] / "sensors").glob("*.yaml"):
+        sensor = hr.load_sensor(file.stem)
+        if sensor.spec.evs is None:
+            continue
+        low, high = (event_curves(sensor, factor * lux) for factor in (0.97, 1.03))
+        rates = [curves.on_hz + curves.off_hz for curves in (low, high)]
+        there = np.minimum(*rates) > (0.1 if file.stem == "reference-mono" else 0)
+        if there.any():
+            seen[file.stem] = np.abs(np.log(rates[1][there] / rates[0][there]) / np.log(1.03 / 0.97)).max()
+    without_leak = seen.pop("reference-mono")
+    assert len(seen) >= 9 and 3 < max(seen.values()) < 4 and 4 < without_leak < 8
