@@ -268,6 +268,23 @@ class FlickerFlux:
             total[:, powered] += weight[powered] * result
         return total
 
+    def reference_changes(
+        self,
+        pixel: NDArray[np.uint32],
+        begin_us: NDArray[np.float64],
+        end_us: NDArray[np.float64],
+        needed: NDArray[np.bool_],
+        base: int,
+        quality: float,
+    ) -> NDArray[np.float64]:
+        """See `AuditableFlux.reference_changes`. Each value has the error that `reference_flux` asks for, as lamps have
+        other powers in other windows.
+        """
+        values = np.zeros((2, *needed.shape))
+        of = np.broadcast_to(pixel, needed.shape)[needed], begin_us[needed], end_us[needed]
+        values[:, needed] = self.reference_flux(*of, quality, events=True)
+        return values
+
 
 def _weighted(halves: Sequence[Halves], weights: Sequence[ArrayLike]) -> Halves:
     """Σ weight · half, for both halves; a weight is a number, or one number per pixel."""

@@ -141,5 +141,30 @@ class AuditableFlux(FluxSource, Protocol):
         [2, n], e⁻/s: the flux, and half the difference of its two halves.
         """
 
+    def reference_changes(
+        self,
+        pixel: NDArray[np.uint32],
+        begin_us: NDArray[np.float64],
+        end_us: NDArray[np.float64],
+        needed: NDArray[np.bool_],
+        base: int,
+        quality: float,
+    ) -> NDArray[np.float64]:
+        """As `reference_flux`, of event pixels in several windows each, for the changes between these.
+
+        Parameters
+        ----------
+        pixel : [n], mosaic indices.
+        begin_us, end_us : [window, n], µs.
+        needed : [window, n], values that are wanted; all others are 0.
+        base : number of the window from which changes are counted.
+        quality : wanted error of a change of ln x over the sensor's noise. The level may be off by more in all windows
+            of a pixel alike.
+
+        Returns
+        -------
+        [2, window, n], e⁻/s: the flux, and half the difference of its two halves.
+        """
+
     def noise_unit(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64], events: bool) -> NDArray[np.float64]:
         """Change of flux equal to one standard deviation of each pixel's noise, at a flux [..., n], e⁻/s."""

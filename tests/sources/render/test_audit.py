@@ -57,6 +57,11 @@ class Given:
         found = self.truth[np.rint(end_us / TICK_US).astype(int) - 1, pixel]
         return np.stack([found, np.zeros(found.size)])
 
+    def reference_changes(self, pixel, begin_us, end_us, needed, base, quality):
+        values, each = np.full((2, *needed.shape), np.nan), np.broadcast_to(pixel, needed.shape)[needed]
+        values[:, needed] = self.reference_flux(each, begin_us[needed], end_us[needed], quality, True)
+        return values
+
 
 def audited(run, truth, seed, rays_each=1):
     sensor, source = sensor_of(), Given(run, truth, rays_each)
@@ -227,20 +232,20 @@ def test_neighbours_of_a_tick_are_rendered_again_where_its_events_differ():
     source = Counting(lights, lights)
     pixels = sensor.layout.evs_pixel.ravel()
     audit = Audit(NotedFlux(source, pixels, TICKS, 1, 2, 1, 1, 1), source, QUALITY, sensor.evs, pixels, 1)
-    reference, _ = audit._reference(units, np.zeros(2, bool), "eventful")
+    reference, _ = audit._reference(units, np.zeros(2, bool), "eventful", 1)
     assert sorted(looked) == [4, 5, 5, 6, 6, 7] and np.all(reference[:, 1] == 1e5)
     np.testing.assert_array_equal(reference[:, 0], step[:, 0])
     # of units that stand still the judged window and the one before are needed, whatever they show
     looked.clear()
-    audit._reference(units, np.array([False, True]), "eventful")
+    audit._reference(units, np.array([False, True]), "eventful", 1)
     assert sorted(looked) == [5, 5, 6, 6]
     assert audit._tick_event(units, step, 2).tolist() == [1, 1] and not audit._tick_event(units, step, 0).any()
     # of units without events the window before is needed
     looked.clear()
-    audit._reference(units, np.array([True, False]), "calm")
+    audit._reference(units, np.array([True, False]), "calm", 1)
     assert sorted(looked) == [5, 5, 6, 6]
     looked.clear()
-    audit._reference(units, np.array([True, False]), "frames")
+    audit._reference(units, np.array([True, False]), "frames", 1)
     assert sorted(looked) == [6, 6]
 
 
@@ -271,6 +276,9 @@ def test_verdict_and_the_quality_that_would_do():
         ([(0.03, 0.041, 0.02)], 1.1, False),
         # one share is enough
         ([(0.001, 0.004, 0.02), (0.0, 0.06, 0.02)], 2.0, True),
+        # an estimate above its limit says nothing yet, and more units would tell
+        ([(0.021, 0.2, 0.02), (0.0, 1.0, 0.02)], 2.0, False),
+        ([(0.05, 0.06, 0.02), (0.0, 1.0, 0.02)], 2.0, True),
         ([], 2.0, False),
     ],
 )
@@ -804,24 +812,86 @@ def test_changes_of_asynchronous_pixels_are_counted_from_the_first_window_of_the
         np.testing.assert_array_equal(units.base_begin_us, base - 900)
         np.testing.assert_allclose(units.base_flux[0], 1.25 * truth[int(base) // TICK_US - 1, units.pixel], rtol=1e-6)
         np.testing.assert_array_equal(units.base_difference, 0)
-    noise = SimpleNamespace(spec=SimpleNamespace(reference="last_event"))
-    audit = Audit(noted, source, QUALITY, noise, pixels, 3)
-    units = begins[9000.0]
-    rough = replace(units, base_difference=0.2 * units.base_flux)
-    flux, spread, known = audit._earlier(rough, np.zeros(units.flux.shape))
-    np.testing.assert_array_equal(flux, units.base_flux)
-    np.testing.assert_array_equal(spread, rough.base_difference)
-    np.testing.assert_array_equal(known[0], truth[4, units.pixel])
-    assert source.rays_traced == units.pixel.size
-    # a sensor with a tick compares with the window before the judged one
-    noise.spec.reference = "previous_sample"
-    reference = units.flux + np.arange(units.flux.shape[0])[:, None]
-    flux, spread, known = audit._earlier(replace(units, difference=0.3 * units.flux), reference)
-    row = int(np.flatnonzero(units.core)[0]) - 1
-    np.testing.assert_array_equal(flux[0], units.flux[row])
-    np.testing.assert_array_equal(known[0], reference[row])
-    np.testing.assert_allclose(spread[0], 0.3 * units.flux[row])
-    assert source.rays_traced == units.pixel.size
+    # with this window in front, as the one that changes are counted from; it states no error
+    rough = replace(begins[9000.0], base_difference=0.2 * begins[9000.0].base_flux)
+    whole = rough.with_base()
+    for name in ("begin_us", "end_us", "flux", "difference"):
+        np.testing.assert_array_equal(getattr(whole, name)[0], getattr(rough, f"base_{name}")[0])
+        np.testing.assert_array_equal(getattr(whole, name)[1:], getattr(rough, name))
+    assert not whole.core[0] and not whole.error[0].any() and whole.core[1:].tolist() == rough.core.tolist()
+    np.testing.assert_array_equal(whole.error[1:], rough.error)
+    np.testing.assert_allclose(whole.noisy[0], 1.2 * rough.base_flux[0])
+
+
+def asynchronous(flux, truth):
+    """An audit of an asynchronous sensor, and a unit for each of two pixels: of four windows, two are judged. Their
+    block begins two windows before the first of these.
+    """
+    noise = SimpleNamespace(
+        spec=SimpleNamespace(reference="last_event"),
+        log_signal=lambda flux, place: np.log(flux + 300.0),
+        layout=SimpleNamespace(evs_shape=(ROWS, COLS)),
+        threshold_on_map=np.float32(0.2),
+        threshold_off_map=np.float32(0.27),
+    )
+    source, pixels = Given(flux, truth), np.arange(ROWS * COLS, dtype=np.uint32)
+    noted = NotedFlux(source, pixels, TICKS, 1, 1, 2, 1, 3)
+    pixel, ends = np.array([7, 40], np.uint32), np.repeat(np.arange(5.0, 9) * TICK_US, 2).reshape(4, 2)
+    rows = np.rint(ends[:, 0] / TICK_US).astype(int) - 1
+    core = np.array([False, True, True, False])
+    of = flux[rows][:, pixel], np.zeros((4, 2)), np.full((4, 2), 3.0)
+    base = np.full((1, 2), 3.0 * TICK_US)
+    units = Units(pixel, ends - 900, ends, core, *of, base - 900, base, flux[2:3, pixel], np.zeros((1, 2)))
+    return Audit(noted, source, QUALITY, noise, pixels, 3), units
+
+
+def test_a_level_that_is_off_everywhere_alike_changes_no_event_of_asynchronous_pixels():
+    """The run is 4 % brighter in all windows of one pixel. A step of 0.25 in the other one comes in the run alone."""
+    truth = np.full((TICKS, ROWS * COLS), 9e4)
+    truth[5:, 7] *= 1.26
+    run = truth.copy()
+    run[:, 7] *= 1.04
+    run[6:, 40] *= 1.29
+    audit, units = asynchronous(run, truth)
+    tally = Tally(2)
+    audit._count(units, np.arange(2), np.zeros(2, np.bool_), "eventful", tally)
+    assert tally.events.true.tolist() == [1, 0] and tally.events.in_run.tolist() == [1, 1]
+    assert tally.events.missed.tolist() == [0, 0] and tally.events.extra.tolist() == [0, 1]
+    # half of the judged windows of the second pixel are off
+    assert tally.off.tolist() == [0, 0.5]
+    level, _ = Tally.deviations(_all_of(tally), of_levels=True)
+    np.testing.assert_allclose(level[-2:], np.log([1.04, 1.29]), rtol=0.01)
+
+
+def _all_of(tally):
+    tally.looked_at = 2
+    return tally
+
+
+@pytest.mark.parametrize("which, looked", [("calm", [3, 5, 6, 7]), ("eventful", [3, 5, 6, 7, 8])])
+def test_windows_of_asynchronous_pixels_that_are_rendered_again(which, looked):
+    """The window that changes are counted from, the judged ones and the one before; with events all. The others change
+    like the run.
+    """
+    truth = np.full((TICKS, ROWS * COLS), 9e4)
+    run = truth * np.linspace(1.1, 1.7, TICKS)[:, None]
+    audit, units = asynchronous(run, truth)
+    seen = []
+    source = audit._source
+    flux_of = source.reference_flux
+
+    def noted(pixel, begin_us, end_us, quality, events):
+        seen.extend(zip(np.rint(end_us / TICK_US).astype(int).tolist(), pixel.tolist(), strict=True))
+        return flux_of(pixel, begin_us, end_us, quality, events)
+
+    source.reference_flux = noted
+    whole, still = units.with_base(), np.array([False, True])
+    reference, _ = audit._reference(whole, still, which, 0)
+    assert sorted({end for end, pixel in seen if pixel == 7}) == looked
+    # what stands still has no events: the judged windows and the earlier one do
+    assert sorted({end for end, pixel in seen if pixel == 40}) == [3, 6, 7]
+    np.testing.assert_allclose(reference[[0, 2, 3]], 9e4)
+    np.testing.assert_allclose(reference[4, 1], 9e4 * run[7, 40] / run[2, 40])
 
 
 def test_frames_have_no_earlier_window():

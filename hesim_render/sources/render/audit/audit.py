@@ -41,7 +41,7 @@ _REFERENCE = 0.5
 #: What an audit can see, for the manifest.
 _COMPARES_WITH = "the same renderer with other random numbers; a wrong model of scene, lens or sensor stays unseen"
 #: Sizes of the first and of the largest batch; after each batch the audit checks whether it has enough units.
-_LEAST_BATCH, _MOST_BATCH = 256, 16384
+_LEAST_BATCH, _MOST_BATCH = 128, 16384
 #: Upper limit for the rays of an audit: a part of the run's own rays, or a fixed number if that is more.
 _PART, _RAYS = 0.25, 30_000_000
 #: Part of these rays after which an audit may give up, because the others would not show what is left to show either.
@@ -106,10 +106,12 @@ class Audit:
             for batch in batches:
                 seen.append(batch)
                 self._look_at(batch, tally, "eventful")
-                spent = self._source.rays_traced - begin
-                if spent > room / 2 or (
-                    self._event_bounds(tally)["extra_at_most"] <= MOST_EXTRA / 2 and spent > room / 8
-                ):
+                spent, bounds = self._source.rays_traced - begin, self._event_bounds(tally)
+                extra, at_most = bounds["extra"], bounds["extra_at_most"]
+                # a bound falls with the number of units at best
+                most_left = extra + (at_most - extra) * 2 * spent / room
+                is_clear = at_most <= MOST_EXTRA / 2 or most_left > MOST_EXTRA
+                if spent > room / 2 or (is_clear and spent > _TRIED * room):
                     break
         start = self._source.rays_traced
         for number, batch in enumerate(chain(seen, batches)):
@@ -151,16 +153,21 @@ class Audit:
     def _count(
         self, units: Units, place: NDArray[np.int64], still: NDArray[np.bool_], which: str, tally: Tally
     ) -> None:
-        events, core, tolerance = which != "frames", units.core, TOLERANCE * self._quality
-        reference, difference = self._reference(units, still, which)
+        events, tolerance = which != "frames", TOLERANCE * self._quality
+        # The window that changes are counted from. A comparator with a tick compares with the sample before; an
+        # asynchronous one with the level of its last event, for which the first window of the block stands.
+        base = max(0, int(np.flatnonzero(units.core)[0]) - 1)
+        if events and not self._has_ticks:
+            units, base = units.with_base(), 0
+        reference, difference = self._reference(units, still, which, base)
+        core, weight = units.core, np.where(still, 1 / _STILL_PART, 1.0)
         unit = self._source.noise_unit(units.pixel, reference, events)[core]
-        weight = np.where(still, 1 / _STILL_PART, 1.0)
         if events:
-            flux, (before, spread, known) = units.flux[core], self._earlier(units, reference)
-            log, own = partial(self._log, units.pixel), (flux, before)
-            deviation = of_changes(log, own, (reference[core], known), unit)
+            log = partial(self._log, units.pixel)
+            run, known, noisy = ((flux[core], flux[base][None]) for flux in (units.flux, reference, units.noisy))
+            deviation = of_changes(log, run, known, unit)
             # what the stated error of the run does on its own
-            by_error = of_changes(log, (flux + units.difference[core], before + spread), own, unit)
+            by_error = of_changes(log, noisy, run, unit)
         else:
             deviation = of_frames(units.flux[core], reference[core], unit)
             by_error = of_frames(units.difference[core], np.zeros(unit.shape), unit)
@@ -170,29 +177,12 @@ class Audit:
         if events:
             moving = np.flatnonzero(~still)
             part, other = units.at(moving), reference[:, moving]
-            counts = self._compare(part, part.flux, other)
+            counts = self._compare(part, part.flux, other, base)
             for total, values in zip(vars(tally.events).values(), vars(counts).values(), strict=True):
                 total[place[moving]] = values
             # counts that errors as large as those of the run and of the reference cause on their own
-            counts = self._compare(part, other + part.difference, other + difference[:, moving])
+            counts = self._compare(part, other + part.difference, other + difference[:, moving], base)
             tally.by_error[place[moving]] = counts.missed + counts.extra + counts.flips
-
-    def _earlier(
-        self, units: Units, reference: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Window that the changes of each unit are counted from, arrays [1, unit], e⁻/s: flux of the run, half the
-        difference of its halves, and flux of the reference.
-
-        It is the sample with which a comparator with a tick compares; an asynchronous one compares with the level of
-        its last event, for which the first window of the block stands.
-        """
-        if self._has_ticks:
-            first = max(0, int(np.flatnonzero(units.core)[0]) - 1)
-            row = slice(first, first + 1)
-            return units.flux[row], units.difference[row], reference[row]
-        span_us = units.base_begin_us[0], units.base_end_us[0]
-        base, _ = self._source.reference_flux(units.pixel, *span_us, _REFERENCE * self._quality, events=True)
-        return units.base_flux, units.base_difference, base[None]
 
     @property
     def _has_ticks(self) -> bool:
@@ -200,39 +190,41 @@ class Audit:
         return self._noise is not None and self._noise.spec.reference == "previous_sample"
 
     def _reference(
-        self, units: Units, still: NDArray[np.bool_], which: str
+        self, units: Units, still: NDArray[np.bool_], which: str, base: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Flux by other random numbers, and half the difference of its halves, [window, unit], e⁻/s. Windows that are
-        not needed keep the values of the run.
+        not needed change like the run from the window `base` on.
         """
         reference, difference = units.flux.copy(), np.zeros(units.flux.shape)
+        first, quality = int(np.flatnonzero(units.core)[0]), _REFERENCE * self._quality
+        needed = np.repeat(units.core[:, None], units.pixel.size, axis=1)
+        if which == "frames":
+            of = units.pixel[np.nonzero(needed)[1]], units.begin_us[needed], units.end_us[needed]
+            reference[needed], difference[needed] = self._source.reference_flux(*of, quality, events=False)
+            return reference, difference
 
         def trace(needed: NDArray[np.bool_]) -> None:
-            place = np.nonzero(needed)[1]
-            reference[needed], difference[needed] = self._source.reference_flux(
-                units.pixel[place],
-                *(units.begin_us[needed], units.end_us[needed]),
-                _REFERENCE * self._quality,
-                events=which != "frames",
-            )
+            of = units.pixel, units.begin_us, units.end_us, needed, base, quality
+            values = self._source.reference_changes(*of)
+            reference[needed], difference[needed] = values[:, needed]
 
-        first = int(np.flatnonzero(units.core)[0])
-        needed = np.repeat(units.core[:, None], units.pixel.size, axis=1)
-        if first > 0 and which != "frames":
-            # changes of ticks are counted from this window, whatever may move
-            needed[first - 1] |= self._has_ticks | ~still
+        # changes are counted from this window, whatever may move
+        needed[base] = True
+        if first > 0:
+            needed[first - 1] |= ~still
         # a unit without events in the run can only have missed ones: their windows are enough
-        if which != "eventful":
-            trace(needed)
-            return reference, difference
-        if self._has_ticks:
-            trace(needed)
+        if which == "eventful" and not self._has_ticks:
+            needed |= ~still
+        trace(needed)
+        if which == "eventful" and self._has_ticks:
             # where both have the same event in the tick that is judged, its neighbours have nothing to say
             unlike = self._tick_event(units, units.flux, first) != self._tick_event(units, reference, first)
-            trace(~needed & ~still & unlike)
-        else:
-            trace(needed | ~still)
-        return reference, difference
+            others = ~needed & ~still & unlike
+            trace(others)
+            needed |= others
+        before = units.flux[base]
+        like = reference[base] / np.where(before > 0, before, 1)
+        return np.where(needed, reference, units.flux * np.where(before > 0, like, 1)), difference
 
     def _tick_event(self, units: Units, flux: NDArray[np.float64], window: int) -> NDArray[np.int8]:
         """Polarity of the event of each unit in a window, 0 without one, as in the first window of all."""
@@ -263,14 +255,17 @@ class Audit:
         on, off = (np.broadcast_to(theta, shape).ravel()[self._place_of[pixel]].astype(np.float64) for theta in maps)
         return on, off
 
-    def _compare(self, units: Units, flux: NDArray[np.float64], reference: NDArray[np.float64]) -> Counted:
+    def _compare(self, units: Units, flux: NDArray[np.float64], reference: NDArray[np.float64], base: int) -> Counted:
         """Compare the events of a flux with those of the reference; both are [window, unit], e⁻/s."""
         assert self._noise is not None
-        run = self._log(units.pixel, flux)
+        run, known = self._log(units.pixel, flux), self._log(units.pixel, reference)
         error = self._log(units.pixel, flux + units.error) - run
-        arguments = run, self._log(units.pixel, reference), error, self._thresholds(units.pixel), units.core
-        if self._noise.spec.reference == "previous_sample":
-            return compare_ticks(*arguments)
+        # comparators see how far ln x has changed, and nothing of the level
+        run = run - run[base] + known[base]
+        if self._has_ticks:
+            return compare_ticks(run, known, error, self._thresholds(units.pixel), units.core)
+        # the window that changes are counted from is none of the stretch
+        arguments = run[1:], known[1:], error[1:], self._thresholds(units.pixel), units.core[1:]
         return compare_crossings(*arguments, _MOST_EVENTS["last_event"])
 
     def _bounds(self, tally: Tally, events: bool) -> dict[str, Any]:

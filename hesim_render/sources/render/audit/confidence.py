@@ -80,10 +80,17 @@ def _least(gain: Callable[[float], NDArray[np.float64]], confidence: float, coun
 
 
 def is_hopeless(shares: list[tuple[float, float, float]], times: float) -> bool:
-    """True if so many times the units would hardly change the verdict. The distance of a bound from its estimate falls
-    with the root of their number: it would not be below the limit, or the estimate is as far above it.
+    """True if so many times the units would hardly change the verdict.
+
+    The distance of a bound from its estimate falls with the root of their number: a bound would not be below the limit,
+    or an estimate is as far above it. An estimate that is above its limit by less says nothing yet.
+
+    Parameters
+    ----------
+    shares : estimate, bound and limit of each share.
+    times : possible number of units over that so far.
     """
-    return any(
-        share + (bound - share) / np.sqrt(times) > most if share <= most else share - (bound - share) > most
-        for share, bound, most in shares
-    )
+    above = [(share, bound - share, most) for share, bound, most in shares if share > most]
+    if above:
+        return any(share - distance > most for share, distance, most in above)
+    return any(share + (bound - share) / np.sqrt(times) > most for share, bound, most in shares)

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -52,6 +52,18 @@ class Units:
         """Some of the units."""
         values = {name: getattr(self, name)[:, place] for name in _OF_UNITS + _OF_BASE}
         return Units(pixel=self.pixel[place], core=self.core, **values)
+
+    @property
+    def noisy(self) -> NDArray[np.float64]:
+        """Flux with an error as large as its own, [window, unit], e⁻/s."""
+        return self.flux + self.difference
+
+    def with_base(self) -> "Units":
+        """The units with the window that changes are counted from in front; it states no error and is not judged."""
+        own = {name: getattr(self, name) for name in _OF_UNITS}
+        base = dict(zip(_OF_UNITS, (*(getattr(self, name) for name in _OF_BASE), 0 * self.base_flux), strict=True))
+        values = {name: np.concatenate([base[name], own[name]]) for name in _OF_UNITS}
+        return replace(self, core=np.append(False, self.core), **values)
 
     @classmethod
     def joined(cls, parts: "Sequence[Units]") -> "Units":

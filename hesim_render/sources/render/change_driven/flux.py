@@ -30,8 +30,8 @@ from hesim_render.sources.render.change_driven.event_blocks import INTERVALS, Bl
 from hesim_render.sources.render.change_driven.forecast import forecast
 from hesim_render.sources.render.change_driven.neighbours import REACH
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
+from hesim_render.sources.render.change_driven.references import References
 from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
-from hesim_render.sources.render.change_driven.retrace import KnownPairs, traced_again
 from hesim_render.sources.render.change_driven.sample_instants import MotionClock
 from hesim_render.sources.render.change_driven.tuning import TUNING, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -101,8 +101,7 @@ class ChangeDrivenFlux:
         self._clock = MotionClock(self.view, tracer.camera, tracer.parts.groups, partial(least_depth_m, tracer))
         self._renderer = AdaptiveRenderer(tracer, noise, quality, tuning.at(quality), self._clock)
         self._index = self._renderer.index
-        #: References of the audit; a small run asks for the same pairs again and again.
-        self._known: dict[tuple[Role, float], KnownPairs] = {}
+        self._references = References(self._renderer)
 
     # ---- as a `SceneRenderer` ---------------------------------------------------------------------
 
@@ -310,18 +309,21 @@ class ChangeDrivenFlux:
         """See `AuditableFlux.reference_flux`: a stream of random numbers of its own."""
         if self._is_dark or pixel.size == 0:
             return np.zeros((2, pixel.size))
-        renderer, index = self._renderer, self._index[pixel]
-        role: Role = "events" if events else "any"
-        wanted = quality if events else quality / renderer.tuning.frame_margin
+        return self._references.values(self._index[pixel], begin_us, end_us, quality, "events" if events else "any")
 
-        def traced(which: NDArray[np.int64]) -> NDArray[np.float64]:
-            return traced_again(
-                *(self._tracer, renderer.zoom, index[which], begin_us[which], end_us[which]),
-                *(partial(renderer.noise.of, role), wanted, renderer.gain, renderer.tuning),
-            )
-
-        known = self._known.setdefault((role, wanted), KnownPairs())
-        return known.values(index, begin_us, end_us, traced)
+    def reference_changes(
+        self,
+        pixel: NDArray[np.uint32],
+        begin_us: NDArray[np.float64],
+        end_us: NDArray[np.float64],
+        needed: NDArray[np.bool_],
+        base: int,
+        quality: float,
+    ) -> NDArray[np.float64]:
+        """See `AuditableFlux.reference_changes`."""
+        if self._is_dark or pixel.size == 0:
+            return np.zeros((2, *needed.shape))
+        return self._references.changes(self._index[pixel], begin_us, end_us, needed, base, quality)
 
     # ---- many windows -----------------------------------------------------------------------------
 

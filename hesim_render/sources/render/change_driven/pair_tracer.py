@@ -170,10 +170,11 @@ class PairTracer(DecisionRays):
         span_us: tuple[float, float] | None = None,
         before: tuple[PilotRays, NDArray[np.integer]] | None = None,
         mild: bool = False,
+        stream: Stream = Stream.RENDER_PILOT,
     ) -> tuple[PilotFlux, PilotRays]:
         """As `pilot`, and the fluxes of the single rays, to compare the same rays in other windows with."""
         kept, used = [dr.empty(jit().Float, pixel.size * samples) for _ in range(2)], np.unique(window)
-        given = pixel, window, windows, samples, footprint_px
+        given = pixel, window, windows, samples, footprint_px, stream
         out = self.pilot(*given, span_us=span_us, before=before, kept=kept, mild=mild)
         spans_us = *windows.begin_us[used].tolist(), *windows.end_us[used].tolist()
         return out, PilotRays(kept[0], kept[1], samples, spans_us)

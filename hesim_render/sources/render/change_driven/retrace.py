@@ -32,39 +32,37 @@ class KnownPairs:
 
     def __init__(self) -> None:
         self._hash = np.empty(0, np.uint64)
-        self._pairs, self._values = np.empty((3, 0)), np.empty((2, 0))
+        self._pairs, self._values = np.empty((0, 0)), np.empty((0, 0))
 
     def values(
-        self,
-        index: NDArray[np.uint32],
-        begin_us: NDArray[np.float64],
-        end_us: NDArray[np.float64],
-        traced: Callable[[NDArray[np.int64]], NDArray[np.float64]],
+        self, pairs: NDArray[np.float64], traced: Callable[[NDArray[np.int64]], NDArray[np.float64]]
     ) -> NDArray[np.float64]:
-        """Values of the listed pairs, [2, n].
+        """Values of the listed pairs, [k, n].
 
         Parameters
         ----------
-        index : [n], numbers on the full sensor.
-        begin_us, end_us : [n], the windows, µs.
-        traced : gives the values of some of them, by their places in these lists.
+        pairs : [m, n], what values depend on: pixel and window, and what else there is.
+        traced : gives the values of some of them, by their places in this list.
         """
         # a hash that is known leads to one place; whether the pair there is the same is compared in full
-        pairs = np.stack([index.astype(np.float64), begin_us, end_us])
         hashed = _hash(pairs)
         place = np.minimum(np.searchsorted(self._hash, hashed), max(0, self._hash.size - 1))
-        is_known = np.zeros(index.size, np.bool_)
+        is_known = np.zeros(hashed.size, np.bool_)
         if self._hash.size:
             is_known = np.all(self._pairs[:, place] == pairs, axis=0)
-        values = np.empty((2, index.size))
-        values[:, is_known] = self._values[:, place[is_known]]
         new = np.flatnonzero(~is_known)
+        got = traced(new) if new.size else self._values[:, :0]
+        values = np.empty((got.shape[0], hashed.size))
+        if self._hash.size:
+            values[:, is_known] = self._values[:, place[is_known]]
+        values[:, new] = got
         if new.size:
-            values[:, new] = traced(new)
-            self._keep(hashed[new], pairs[:, new], values[:, new])
+            self._keep(hashed[new], pairs[:, new], got)
         return values
 
     def _keep(self, hashed: NDArray[np.uint64], pairs: NDArray[np.float64], values: NDArray[np.float64]) -> None:
+        if not self._hash.size:
+            self._pairs, self._values = np.empty((pairs.shape[0], 0)), np.empty((values.shape[0], 0))
         every, first = np.unique(np.concatenate([self._hash, hashed]), return_index=True)
         if every.size <= _MOST_KNOWN:
             self._hash = every
@@ -114,7 +112,7 @@ def traced_again(
     pixel = pairs[0].astype(np.uint32)
     span, window = distinct_columns(pairs[1:])
     windows = Windows(span[0], span[1])
-    aims = _aims(zoom, pixel, tracer.sensor.spec.geometry.cols, windows, window)
+    aims = aims_of(zoom, pixel, tracer.sensor.spec.geometry.cols, windows, window)
     pilot = _pilot(tracer, pixel, windows, window, tuning.audit_pilot_rays, aims)
     # known shadows, as in the run
     own_unit = unit_of(pixel)
@@ -152,19 +150,41 @@ def traced_again(
         )  # fmt: skip
         wanted_times = np.where(rays < law, 1, wanted_times)
     times = np.clip(wanted_times, 1, tuning.most_audit_times).astype(np.int64)
+    values = traced_repeatedly(tracer, (pixel, window, windows, rays), controlled, times, aims, edges, shadows)
+    return values[:, place.ravel()]
+
+
+def traced_repeatedly(
+    tracer: PairTracer,
+    pairs: tuple[NDArray[np.uint32], NDArray[np.integer], Windows, NDArray[np.integer]],
+    controlled: NDArray[np.bool_],
+    times: NDArray[np.int64],
+    aims: PairAims | None = None,
+    edges: PairEdges | None = None,
+    shadows: NDArray[np.uint32] | None = None,
+) -> NDArray[np.float64]:
+    """Mean of some traces of each pair, and half the difference of its halves, [2, n], e⁻/s.
+
+    Parameters
+    ----------
+    pairs : pixels [n] on the full sensor, their windows, all windows, and rays of a trace.
+    times : [n], number of traces.
+    controlled, aims, edges, shadows : see `PairTracer.trace`.
+    """
+    pixel, window, windows, rays = pairs
     # one entry a repetition, with random numbers by its number; the mean is taken over those of a pair
     each, first = np.repeat(np.arange(pixel.size), times), np.cumsum(times) - times
     of = pixel[each], window[each], windows, rays[each], controlled[each], Stream.AUDIT
     repeat = np.arange(each.size) - first[each]
     got = tracer.trace(
         *of, repeat=repeat, aims=None if aims is None else aims.part(each),
-        edges=None if edges is None else edges.part(each), shadows=shadows[each],
+        edges=None if edges is None else edges.part(each), shadows=None if shadows is None else shadows[each],
     )  # fmt: skip
     values = 0.5 * np.stack([got.half_a + got.half_b, got.half_a - got.half_b]).astype(np.float64)
-    return (np.add.reduceat(values, first, axis=1) / times)[:, place.ravel()]
+    return np.asarray(np.add.reduceat(values, first, axis=1) / times)
 
 
-def _aims(
+def aims_of(
     zoom: Zoom, pixel: NDArray[np.uint32], cols: int, windows: Windows, window: NDArray[np.int64]
 ) -> PairAims | None:
     """Objects at which rays of listed pairs are aimed; None if there are none."""
