@@ -175,7 +175,9 @@ def test_known_pairs_are_those_that_were_traced(monkeypatch, alike, room):
             asked.extend(zip(*(values[which].tolist() for values in given), strict=True))
             return value(*(values[which].astype(float) for values in given))
 
-        np.testing.assert_array_equal(known.values(np.stack([index.astype(float), begin, end]), traced), value(index.astype(float), begin, end))
+        np.testing.assert_array_equal(
+            known.values(np.stack([index.astype(float), begin, end]), traced), value(index.astype(float), begin, end)
+        )
     if not alike and room > 40:  # a pair that is listed twice in one call is traced by one of them
         assert len(asked) < 1.5 * len(set(asked)) and len(set(asked)) > 25
 

@@ -1,4 +1,4 @@
-"""References of the audit for pixels that see paths: changes from few rays, the same number in all windows of a unit."""
+"""References of the audit for pixels that see paths: changes from few rays, equally many in all windows of a unit."""
 
 from pathlib import Path
 
