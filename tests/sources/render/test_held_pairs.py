@@ -456,7 +456,7 @@ def test_held_windows_are_knots_and_the_ends_of_courses():
     what = SimpleNamespace(rendered=rendered)
     what.until = lambda window: what
     renderer = SimpleNamespace(
-        has_ticks=False, look_stride=4, pilot=lambda *_: (None, None), plan=lambda *_, is_knot: what,
+        has_ticks=False, look_stride=4, pilot=lambda *_: (None, None), plan=lambda *_, is_knot, windows: what,
         follow=lambda *_: (what, None, of_edge, held), render=lambda *_, first, fit: (flux, None),
     )  # fmt: skip
     blocks = Blocks.__new__(Blocks)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.distinct import distinct_columns
 from hesim_render.sources.render.change_driven.aim import PairAims
+from hesim_render.sources.render.change_driven.bends import straightened
 from hesim_render.sources.render.change_driven.deep_shadow import deep_shadow
 from hesim_render.sources.render.change_driven.edge_courses import Courses, courses
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
@@ -116,19 +117,7 @@ class AdaptiveRenderer:
         width = self._footprint_px(band)
         row, col = np.divmod(band.sites.index.astype(np.int64), cols)
         looks = self.zoom.sites(row, col, windows, numbers)
-        given = (
-            self.tracer,
-            band.sites,
-            windows,
-            numbers,
-            band.pilot_rays,
-            width,
-            span_us,
-            looks,
-            anchored,
-            known,
-            stride,
-        )
+        of = self.tracer, band.sites, windows, numbers, band.pilot_rays, width
 
         def wanted(flux: NDArray[np.float32]) -> NDArray[np.float32]:
             return np.float32(band.quality) * band.unit(flux)
@@ -137,7 +126,7 @@ class AdaptiveRenderer:
         steps, few = len(numbers) - 1, 1
         if self.has_ticks and steps > 1:
             few = self._clock.windows_of_a_pixel(*windows.span_us, steps)
-        pilot, near = take_pilot(*given, wanted, band.mild, few)
+        pilot, near = take_pilot(*of, span_us, looks, anchored, known, stride, wanted, band.mild, few)
         if band.apart and pilot.windows > 2:
             # no neighbour tells when deep shadow ends
             seen = pilot.steady_flux, pilot.unshadowed
@@ -159,8 +148,10 @@ class AdaptiveRenderer:
         """Width of the area in which pilot rays of a band start, px."""
         return self.tuning.lone_footprint_px if band.apart else self.tuning.footprint_px
 
-    def plan(self, pilot: Pilot, band: Band, is_knot: bool) -> Plan:
-        """Which pairs of a band are rendered, with how many rays; see `plan`."""
+    def plan(self, pilot: Pilot, band: Band, is_knot: bool, windows: Windows | None = None) -> Plan:
+        """Which pairs of a band are rendered, with how many rays; see `plan`. Of the windows of a block, those between
+        which the light of paths is a straight line are left out; this traces rays.
+        """
         given = pilot, band.sites, band.unit, band.quality, self.gain, self.tuning
         # windows of synchronous sensors are too far apart for an edge to stay within a pixel
         what = plan(*given, is_knot=is_knot, follows=self.look_stride > 1 and self.tracer.rays.is_box)
@@ -168,6 +159,10 @@ class AdaptiveRenderer:
             # a highlight or a caustic may be there all the same
             dark = what.pilot < _NOTHING * what.wanted
             what.rays[dark] = np.maximum(what.rays[dark], np.int16(self.tuning.dark_rays))
+        if windows is not None and not (self.tracer.is_diffuse or self.has_ticks):
+            before = self.tracer.rays_done
+            what = straightened(self.tracer, band.index, windows, what, self.tuning)
+            self.counts.rays += self.tracer.rays_done - before
         return what
 
     def follow(

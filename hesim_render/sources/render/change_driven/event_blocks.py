@@ -92,7 +92,9 @@ class Blocks:
             numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.sites.size))
             pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride)
             # what lies behind the last wanted window, at the end of a run, is not rendered
-            what = renderer.plan(pilot, band, is_knot=True).until(int(np.flatnonzero(block.wanted)[-1]))
+            what = renderer.plan(pilot, band, is_knot=True, windows=windows).until(
+                int(np.flatnonzero(block.wanted)[-1])
+            )
             numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.place.size))
             if first is None and anchor.span_us == (block.begin_us[0], block.end_us[0]):
                 first = anchor.flux_of(np.arange(band.place.size))

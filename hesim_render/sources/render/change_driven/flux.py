@@ -224,10 +224,10 @@ class ChangeDrivenFlux:
             pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, *against)
             rays[3] += share * (renderer.counts.pilot_rays - before)
             # the same plan as in a run, of which the rays are counted and not traced
-            what = renderer.plan(pilot, band, is_knot=role == "events").until(
-                windows.size - 1 if until is None else until
-            )
             before, fit = self._tracer.rays_done, None
+            block = windows if role == "events" and windows.size > 1 else None
+            what = renderer.plan(pilot, band, is_knot=role == "events", windows=block)
+            what = what.until(windows.size - 1 if until is None else until)
             if windows.size > 1:
                 what, fit, *_ = renderer.follow(band, windows, numbers[:, : band.place.size], what)
             rays[0] += self._tracer.rays_done - before

@@ -116,6 +116,13 @@ class Tuning:
         asks for.
     flat_part : part, C. Of the rays by the law, a pair in which decision rays find no contrast keeps this part at
         least. Without (0): thin objects between the decision rays make single values that are far off.
+    bend_rays : rays, F. From `room` and `floor-ball` of `benchmarks/scenes` alone: rays in each window that the pilot
+        marked, of pixels that see paths, which say where the flux bends. Half as many: as many windows are rendered.
+        Larger (512): they cost more than they save.
+    bend_gain : factor, C. They look where the marked windows take this many times as many rays. Without (0): cheap
+        windows are looked at for as much as rendering them takes.
+    bend : wanted errors, F. From the same scenes: largest distance of such a window from the line between others.
+        Larger (3): changes are off by more. Without (0): every window is rendered.
     least_difference_rays : rays, C. Least number of rays of a difference. Without: no pilot ray sees a change, and few
         rays see none either.
     difference_gain : factor, C. A pair is rendered as a difference where that takes this many times fewer rays. Without
@@ -182,6 +189,9 @@ class Tuning:
     flat_contrast: float = 4.0
     low_contrast: float = 16.0
     flat_part: float = 1 / 8
+    bend_rays: int = 256
+    bend_gain: float = 3.0
+    bend: float = 2.1
     least_difference_rays: int = 64
     difference_gain: float = 4.0
     difference_part: float = 0.5

@@ -1,0 +1,157 @@
+"""Windows between which the flux of a pixel that sees paths is a straight line are not rendered."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import hesim_render as hr
+from hesim_render.core.rng import Stream
+from hesim_render.sources.render.change_driven.bends import polyline, straightened
+from hesim_render.sources.render.change_driven.differences import Differences
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.plan import Plan
+from hesim_render.sources.render.change_driven.tuning import TUNING
+from hesim_render.sources.render.change_driven.windows import Windows
+
+KNOT = Path(__file__).parents[3] / "benchmarks/scenes/sky-knot.yaml"
+
+
+def one_by_one(time, flux, known, most):
+    """The same for one pixel: the line between two windows is split where a known one is furthest off."""
+    needed = {0, time.size - 1}
+
+    def split(first, last):
+        inner = [k for k in range(first + 1, last) if known[k]]
+        line = np.interp(time, time[[first, last]], flux[[first, last]])
+        off = {k: abs(flux[k] - line[k]) / most[k] for k in inner}
+        worst = max(off, key=off.get, default=None)
+        if worst is not None and off[worst] > 1:
+            needed.add(worst)
+            split(first, worst)
+            split(worst, last)
+
+    split(0, time.size - 1)
+    return sorted(needed)
+
+
+def test_a_polyline_has_the_windows_that_are_furthest_off():
+    rng = np.random.default_rng(3)
+    time = np.cumsum(rng.uniform(20, 300, 40))
+    flux = np.cumsum(rng.normal(0, 40, (40, 60)), axis=0).astype(np.float32) + 900
+    most = rng.uniform(30, 150, (40, 60)) * np.linspace(0.5, 6, 60).astype(np.float32)
+    known = rng.random((40, 60)) < 0.4
+    known[[0, -1]] = True
+    needed = polyline(flux, known, time, most)
+    sizes = set()
+    for pixel in range(60):
+        expected = one_by_one(time, *(values[:, pixel] for values in (flux, known, most)))
+        assert np.flatnonzero(needed[:, pixel]).tolist() == expected
+        sizes.add(len(expected))
+    assert min(sizes) == 2 and max(sizes) > 6
+    # a window exactly at its bound is on the line
+    flat, bound = np.array([[8.0], [8.5], [8.0]], np.float32), np.full((3, 1), 0.5, np.float32)
+    assert polyline(flat, np.ones((3, 1), np.bool_), time[:3], bound)[:, 0].tolist() == [True, False, True]
+
+
+def plan_of(count, pixels):
+    rays = np.full((count, pixels), 4096, np.int16)
+    rendered, none = np.ones((count, pixels), np.bool_), np.zeros((count, pixels), np.bool_)
+    values = np.full((count, pixels), 3.0, np.float32)
+    return Plan(
+        *(rendered, rays, none.copy(), values, values, 0 * rays, Differences.none(count, pixels)),
+        *(none.copy(), none.copy(), none.copy(), values),
+    )
+
+
+class Looks:
+    """A tracer whose looks see given fluxes [window, pixel], by either estimator."""
+
+    def __init__(self, controlled, plain):
+        self.tables, self.asked = (controlled, plain), []
+
+    def pilot(self, pixel, window, windows, samples, footprint_px, stream, repeat):
+        assert (samples, footprint_px, stream) == (TUNING.bend_rays, 1.0, Stream.RENDER_EDGE) and repeat > 2
+        self.asked += list(zip(window.tolist(), pixel.tolist(), strict=True))
+        return SimpleNamespace(controlled=self.tables[0][window, pixel - 7], plain=self.tables[1][window, pixel - 7])
+
+
+def test_what_is_left_out_and_what_is_not():
+    """Nine windows. The flux of pixels 0 to 4 bends in window 5 alone, by the controlled estimator."""
+    count, pixels = 9, 6
+    ends = np.cumsum([100.0, 30, 70, 80, 40, 60, 90, 20, 50])
+    windows = Windows(ends - 1, ends)
+    line = np.interp(ends, ends[[0, 5, 8]], [500.0, 600.0, 580.0])
+    bent = np.repeat(line[:, None], pixels, axis=1).astype(np.float32)
+    tracer = Looks(bent, np.full_like(bent, 500))
+    what = plan_of(count, pixels)
+    what.controlled[:, :5] = True
+    # a difference and a small object stay as they are, and take no look; of window 7 nothing was marked
+    what.differences.rays[3, 1] = 64
+    what.barred[4, 1] = True
+    what.rendered[7, :2] = False
+    what.fitted[2, 0] = what.fitted[5, 0] = what.asked[6, 0] = what.asked[5, 2] = True
+    # seven windows of 512 rays are not worth three times nine looks of 256; two of 4096 are worth four
+    what.rays[:, 3] = 512
+    what.rendered[2:5, 4] = what.rendered[6:8, 4] = False
+    new = straightened(tracer, np.arange(7, 13, dtype=np.uint32), windows, what, TUNING)
+    rows = [np.flatnonzero(new.rendered[:, pixel]).tolist() for pixel in range(pixels)]
+    assert rows == [[0, 5, 8], [0, 3, 4, 5, 8], [0, 5, 8], list(range(9)), [0, 5, 8], [0, 8]]
+    assert not new.fitted[2, 0] and new.fitted[5, 0] and not new.asked[6, 0] and new.asked[5, 2]
+    looked = {pixel: sorted(window for window, other in tracer.asked if other == 7 + pixel) for pixel in range(pixels)}
+    assert looked[0] == [0, 1, 2, 3, 4, 5, 6, 8] and looked[1] == [0, 1, 2, 5, 6, 8]
+    assert looked[3] == [] and looked[4] == [0, 1, 5, 8]
+    # one window alone is rendered
+    what.rendered[1:-1] = False
+    what.rendered[5] = True
+    assert np.all(straightened(tracer, np.arange(7, 13, dtype=np.uint32), windows, what, TUNING).rendered[5])
+
+
+def values_of(seconds, cols, rows, tuning=TUNING):
+    sensor = hr.load_sensor("davis346").crop(cols, rows, 162, 118)
+    source = ChangeDrivenFlux(hr.load_scene(KNOT), sensor, tuning=tuning)
+    spec, pixel = source.sensor.spec.evs, source.sensor.layout.evs_pixel.ravel()
+    blocks = list(source.sample_blocks(int(spec.window_us), 0.0, 1e6 * seconds))
+    wins = np.concatenate([np.stack([b.begin_us[b.wanted], b.end_us[b.wanted]], axis=1) for b in blocks])
+    flux = [0.5 * (np.array(s.half_a) + np.array(s.half_b)) for s in source.flux_of_blocks(pixel, blocks)]
+    return source, wins, np.array(flux, np.float64)
+
+
+def test_no_value_depends_on_the_end_of_the_run_and_half_of_the_rays_are_left():
+    source, _, flux = values_of(0.012, 5, 4)
+    _, _, short = values_of(0.007, 5, 4)
+    np.testing.assert_array_equal(short, flux[: len(short)])
+    every, _, _ = values_of(0.012, 5, 4, replace(TUNING, bend_gain=1e9))
+    assert source.counts.rays < 0.7 * every.counts.rays
+
+
+@pytest.mark.slow
+def test_a_turning_mesh_takes_fewer_rays_for_the_same_errors():
+    """Against 6 × 4096 rays of other numbers."""
+    every, wins, dense = values_of(0.02, 14, 10, replace(TUNING, bend_gain=1e9))
+    source, _, flux = values_of(0.02, 14, 10)
+    assert source.counts.rays < 0.7 * every.counts.rays
+    rng = np.random.default_rng(4)
+    window, place = rng.integers(1, len(wins), 300), rng.integers(0, flux.shape[1], 300)
+    windows, pixel = Windows(wins[:, 0], wins[:, 1]), source._index[source.sensor.layout.evs_pixel.ravel()[place]]
+    truth = np.zeros(300)
+    for repeat in range(6):
+        got = source._tracer.trace(
+            *(pixel, window, windows, np.full(300, 4096), np.zeros(300, np.bool_)), repeat=repeat + 5
+        )
+        truth += 0.5 * (got.half_a + got.half_b) / 6
+    unit = source.noise_unit(source.sensor.layout.evs_pixel.ravel()[place], truth, True)
+    rms = [np.sqrt(np.mean(((values[window, place] - truth) / unit) ** 2)) for values in (flux, dense)]
+    assert rms[0] < 1.1 * rms[1] + 0.02 and rms[1] < 1.0
+
+
+@pytest.mark.parametrize("scene", ["rotating-star"])
+def test_direct_light_keeps_its_windows(monkeypatch, scene):
+    from hesim_render.sources.render.change_driven import adaptive
+
+    monkeypatch.setattr(adaptive, "straightened", lambda *_: pytest.fail("lines know edges better"))
+    source = ChangeDrivenFlux(hr.load_scene(scene), hr.load_sensor("davis346").crop(8, 6, 160, 120))
+    blocks = list(source.sample_blocks(1, 0.0, 2000.0))
+    assert len(list(source.flux_of_blocks(source.sensor.layout.evs_pixel.ravel(), blocks))) > 1
