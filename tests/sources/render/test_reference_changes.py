@@ -1,12 +1,17 @@
 """References of the audit for pixels that see paths: changes from few rays, equally many in all windows of a unit."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import hesim_render as hr
+from hesim_render.core.rng import Stream
+from hesim_render.sources.render.change_driven import references
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.references import References
+from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
 
 BALL = Path(__file__).parents[3] / "benchmarks/scenes/floor-ball.yaml"
@@ -129,3 +134,87 @@ def test_direct_light_and_aimed_rays_keep_references_of_the_level():
     np.testing.assert_array_equal(mixed[:, needed][:, is_aimed], level[:, is_aimed])
     # some take as many rays of the same stream, all the same
     assert np.mean(mixed[0][needed][~is_aimed] == level[0][~is_aimed]) < 0.6
+
+
+def planned(flux, scatter, change, unshadowed, quality=0.25):
+    """Rays and repeats of units whose audit pilot sees these tables, [window, unit]; noise is 1 % and 5 e⁻/s."""
+    flux, scatter, change, unshadowed = (np.array(each, np.float32) for each in (flux, scatter, change, unshadowed))
+    index = np.arange(3, 3 + flux.shape[1], dtype=np.uint32)
+    streams = []
+
+    def seen(rows):
+        return SimpleNamespace(
+            plain=flux[rows].ravel(), plain_scatter=scatter[rows].ravel(),
+            plain_change=change[rows].ravel(), unshadowed=unshadowed[rows].ravel(),
+        )  # fmt: skip
+
+    def pilot_rays(pixel, window, windows, samples, footprint_px, stream):
+        streams.append(stream)
+        assert samples == 64 and footprint_px == 1.0 and set(windows.end_us[window]) == {ENDS_US[BASE]}
+        return seen([BASE]), "kept"
+
+    def pilot(pixel, window, windows, samples, footprint_px, stream, before):
+        streams.append(stream)
+        assert before[0] == "kept" and before[1].tolist() == np.tile(np.arange(index.size), 4).tolist()
+        np.testing.assert_array_equal(windows.end_us[window], np.repeat(ENDS_US, index.size))
+        np.testing.assert_array_equal(pixel, np.tile(index, 4))
+        return seen(slice(None))
+
+    renderer = SimpleNamespace(
+        tracer=SimpleNamespace(pilot_rays=pilot_rays, pilot=pilot), tuning=TUNING, gain=Gain(0.46, 0.56),
+        noise=SimpleNamespace(of=lambda role, index: lambda flux: (0.01 * flux + 5) * (role == "events")),
+    )  # fmt: skip
+    end = np.repeat(ENDS_US[:, None], index.size, axis=1)
+    got = References(renderer)._rays_of(index, end - 1, end, BASE, quality)
+    assert set(streams) == {Stream.AUDIT_PILOT}
+    return got.T.tolist()
+
+
+def test_the_window_that_needs_most_decides_how_many_rays_its_unit_gets():
+    """By hand, from ε = 0.25·(0.01·F + 5), with F = 1500 and so ε = 5 unless said. Changes are from the third window."""
+    even, none = [1500.0] * 4, [0.0] * 4
+
+    def one(flux, scatter, change, unshadowed, **named):
+        return planned(*([[value] for value in each] for each in (flux, scatter, change, unshadowed)), **named)[0]
+
+    # nothing changes and hardly anything scatters
+    assert one(even, none, none, none) == [64, 1]
+    # (0.95 · 100/5)² = 361, of the last window alone
+    assert one(even, none, [0, 0, 0, 100], none) == [512, 1]
+    # the last window is twice as bright: ε = 8.75, and rays scatter by 400 in common. 0.95 · 400 · 1500/1500/8.75 =
+    # 43.4, squared 1886; the level asks for (0.46 · 400/45)^(1/0.56) = 12 only
+    assert one([1500, 1500, 1500, 3000], [400] * 4, none, none) == [2048, 1]
+    # the level: (0.46 · 1500/45)^(1/0.56) = 131
+    assert one(even, [0, 1500, 0, 0], none, none) == [256, 1]
+    # in a dark window, a level by three hundredths asks for (0.46 · 90/3)^(1/0.56) = 108; there ε = 1.5
+    assert one([1500, 100, 1500, 1500], [0, 90, 0, 0], none, none) == [128, 1]
+    # and in one that is darker still, ε = 1.275 is more than that: (0.46 · 90/1.275)^(1/0.56) = 391
+    assert one([1500, 10, 1500, 1500], [0, 90, 0, 0], none, none) == [512, 1]
+    # 8000/(2 · 5) = 800 for the weight of a ray
+    assert one(even, none, none, [0, 0, 0, 8000]) == [1024, 1]
+    # (0.95 · 500/5)² = 9025 takes three times 4096, (0.95 · 900/5)² = 29241 more than four
+    assert one(even, none, [500, 0, 0, 0], none) == [4096, 3]
+    assert one(even, none, [900, 0, 0, 0], none) == [4096, 4]
+    # twice the wanted error, a quarter of the rays
+    assert one(even, none, [0, 0, 0, 100], none, quality=0.5) == [128, 1]
+    # units have numbers of their own
+    every = planned([even[:2]] * 4, np.zeros((4, 2)), [[0, 0], [0, 0], [0, 0], [100, 500]], np.zeros((4, 2)))
+    assert every == [[512, 1], [4096, 3]]
+
+
+def test_a_unit_is_aimed_if_any_of_its_windows_is(monkeypatch):
+    count = np.array([[0, 0, 2], [0, 1, 0], [0, 0, 0], [0, 0, 0]])
+    zoom, end = object(), np.repeat(ENDS_US[:, None], 3, axis=1)
+
+    def aims_of(given, pixel, cols, windows, window):
+        assert given is zoom and cols == 346
+        np.testing.assert_array_equal(windows.end_us[window], end.ravel())
+        np.testing.assert_array_equal(pixel, np.tile([5, 6, 9], 4))
+        return SimpleNamespace(count=count.ravel())
+
+    monkeypatch.setattr(references, "aims_of", aims_of)
+    geometry = SimpleNamespace(spec=SimpleNamespace(geometry=SimpleNamespace(cols=346)))
+    known = References(SimpleNamespace(zoom=zoom, tracer=SimpleNamespace(sensor=geometry)))
+    assert known._is_aimed(np.array([5, 6, 9], np.uint32), end - 1, end).tolist() == [False, True, True]
+    monkeypatch.setattr(references, "aims_of", lambda *_: None)
+    assert not known._is_aimed(np.array([5, 6, 9], np.uint32), end - 1, end).any()
