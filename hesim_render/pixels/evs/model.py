@@ -262,7 +262,8 @@ class EvsNoise(PlainState):
         [..., n], electrons: the larger of s and θ/20·x, over the slope dx/dN.
         """
         kind = np.result_type(electrons, np.float32)
-        k = self.table.each(lambda values: values.astype(kind)[position])
+        # coefficients that all pixels share are not spread over the pixels
+        k = self.table.each(lambda values: values.astype(kind)[slice(None) if values.size == 1 else position])
         theta = min(self.spec.contrast_threshold_on, self.spec.contrast_threshold_off)
         counted = np.maximum(electrons, kind.type(0))
         least = kind.type(LEAST_NOISE_THETA * theta)

@@ -164,6 +164,17 @@ def board(rows=3, cols=5, step=(1, 1)):
     return Sites.around(lattice.index(row, col), lattice)
 
 
+def test_each_site_is_looked_at_from_its_own_last_look_on():
+    """The light of all changes in window 8, in which few rays look everywhere: sites of one field looked in window 7,
+    those of the other in 6, and looks begin one window before what was not looked at.
+    """
+    sites = board()
+    _, found = found_by(light_of(sites.size, **{f"s{site}": (8, 90.0) for site in range(sites.size)}), sites)
+    odd = np.add(*np.divmod(np.arange(sites.size), 5)) % 2 == 1
+    for site in range(sites.size):
+        assert windows_of(found, site) == ([6, 7, 8] if odd[site] else [7, 8])
+
+
 @pytest.mark.parametrize("step", [(1, 1), (2, 3)])
 def test_neighbours_take_turns_like_the_fields_of_a_chequered_board(step):
     """Each site in about half of the windows, never in the same as the four beside it; all in the first and in the

@@ -31,16 +31,16 @@ _ROUNDING, _SAME = np.float32(1e-5), np.float32(1.0)
 Wanted = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 
-def least_change(flux: NDArray[np.float32], wanted: Wanted | None) -> NDArray[np.float32]:
+def least_change(flux: NDArray[np.float32], wanted: NDArray[np.float32] | None) -> NDArray[np.float32]:
     """Smallest change of the pilot's flux that means that a pixel shows something new, [site], e⁻/s.
 
     Parameters
     ----------
     flux : [site], e⁻/s.
-    wanted : maps it to the wanted error of a pair, e⁻/s; None: any change counts that is not due to rounding.
+    wanted : [site], wanted error of a pair with this flux, e⁻/s; None: any change counts that is not due to rounding.
     """
     least = _ROUNDING * np.abs(flux)
-    return least if wanted is None else np.maximum(least, _SAME * wanted(flux))
+    return least if wanted is None else np.maximum(least, _SAME * wanted)
 
 
 def better_estimate(seen: PilotFlux) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -120,19 +120,22 @@ def windows_with_changes(
         )
         flux_there, scatter_there = better_estimate(got)
         # what this set saw of each site the last time, and when
-        last, when = np.zeros(size, np.float32), np.zeros(size, np.int64)
+        last, when = np.zeros(size, np.float32), np.zeros(size, np.int16)
+        wanted_there = wanted(last)
         ends = np.searchsorted(window, np.arange(count + 1))
         for now, (begin, end) in enumerate(pairwise(ends.tolist())):
             if begin == end:
                 continue
             some, level, spread = site[begin:end], last.copy(), np.zeros(size, np.float32)
             level[some], spread[some] = flux_there[begin:end], scatter_there[begin:end]
+            wanted_before, wanted_there = wanted_there, wanted(level)
             if now:
-                differs = (np.abs(level - last) > least_change(last, wanted)) | (spread > most * wanted(level))
+                differs = np.abs(level - last) > least_change(last, wanted_before)
+                differs |= spread > most * wanted_there
                 new[now, some], seen[now, some] = differs[some], True
                 if sites.board is not None:
                     # in windows since the last look, in which these rays did not look
-                    for between in range(1, now):
+                    for between in range(int(when[differs].min(initial=now)) + 1, now):
                         new[between] |= differs & (when < between)
             last, when[some] = level, now
     out = new.copy()

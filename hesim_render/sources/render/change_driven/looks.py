@@ -110,4 +110,5 @@ class Looks:
         # one estimator for both windows, so that a difference is one of the scene
         is_controlled = tables["controlled_scatter"][early] <= tables["plain_scatter"][early]
         begin, end = (np.where(is_controlled, tables["controlled"][k], tables["plain"][k]) for k in (early, late))
-        return np.asarray(np.abs(end - begin) > least_change(begin, wanted))
+        least = least_change(begin, None if wanted is None else wanted(begin))
+        return np.asarray(np.abs(end - begin) > least)

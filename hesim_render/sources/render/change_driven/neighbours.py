@@ -1,6 +1,7 @@
 """The pixels of a list and their neighbours."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,15 +61,32 @@ class Board:
     cell: NDArray[np.int64]
     odd: NDArray[np.bool_]
 
+    @cached_property
+    def _whole(self) -> tuple[slice, slice]:
+        """The longest run of rows of which all fields are sites, and the places of these among the sites."""
+        rows, cols = self.shape
+        # place of the first site of each row
+        first = np.searchsorted(self.cell, np.arange(rows + 1) * cols)
+        is_whole = np.diff(first) == cols
+        edges = np.flatnonzero(np.diff(is_whole, prepend=False, append=False))
+        if edges.size == 0:
+            return slice(0, 0), slice(0, 0)
+        begins, ends = edges[::2], edges[1::2]
+        longest = int(np.argmax(ends - begins))
+        begin, end = int(begins[longest]), int(ends[longest])
+        return slice(begin, end), slice(int(first[begin]), int(first[end]))
+
     def image(self, values: NDArray, margin: int, empty: float | bool) -> NDArray:
         """Values of the sites [m] in the rectangle, with a margin around; `empty` in all other fields."""
         rows, cols = self.shape
         image = np.full((rows + 2 * margin, cols + 2 * margin), empty, values.dtype)
-        inner = values
-        if self.cell.size < rows * cols:
-            inner = np.full(rows * cols, empty, values.dtype)
-            inner[self.cell] = values
-        image[margin : margin + rows, margin : margin + cols] = inner.reshape(rows, cols)
+        inner = image[margin : margin + rows, margin : margin + cols]
+        # most sites of a band lie in whole rows, which are copied as they are; the others go to their fields
+        whole, sites = self._whole
+        inner[whole] = values[sites].reshape(-1, cols)
+        for others in (slice(0, sites.start), slice(sites.stop, None)):
+            row, col = np.divmod(self.cell[others], cols)
+            inner[row, col] = values[others]
         return image
 
     def near(self, marked: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
@@ -106,6 +124,8 @@ class Sites:
     board: Board | None = None
     apart: bool = True
     _count: list[NDArray[np.float32]] = field(default_factory=list)
+    #: Cells of the listed pixels, where many statistics of a few of them are asked for.
+    _cells: NDArray[np.int64] | None = None
 
     @classmethod
     def alone(cls, pixel: NDArray[np.uint32]) -> "Sites":
@@ -145,7 +165,8 @@ class Sites:
 
     def only(self, some: NDArray[np.int64]) -> "Sites":
         """The same sites, with some of the listed pixels as the list."""
-        only = replace(self, listed=self.listed[some], _count=[])
+        listed = self.listed[some]
+        only = replace(self, listed=listed, _count=[], _cells=None if self.board is None else self.board.cell[listed])
         if not self.apart:
             only._count.append(self._counted()[some])
         return only
@@ -175,15 +196,8 @@ class Sites:
             return values[self.listed]
         lowest = False if values.dtype == np.bool_ else -np.inf
         image = self.board.image(values, radius, lowest)
-        # along rows, then along columns: 4r steps in place of (2r + 1)²
-        cols, rows = image.shape[1] - 2 * radius, image.shape[0] - 2 * radius
-        across = image[:, :cols]
-        for shift in range(1, 2 * radius + 1):
-            across = np.maximum(across, image[:, shift : shift + cols])
-        within = across[:rows]
-        for shift in range(1, 2 * radius + 1):
-            within = np.maximum(within, across[shift : shift + rows])
-        return self._at_listed(within)
+        # along rows, then along columns
+        return self._at_listed(_most_along(_most_along(image.T, 2 * radius + 1).T, 2 * radius + 1))
 
     def near(self, marked: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
         """True at sites [m] at most `radius` pixels away from a marked one [m], also diagonally."""
@@ -191,7 +205,19 @@ class Sites:
 
     def _at_listed(self, image: NDArray) -> NDArray:
         assert self.board is not None
-        return image.ravel()[self.board.cell[self.listed]]
+        return image.ravel()[self.board.cell[self.listed] if self._cells is None else self._cells]
+
+
+def _most_along(image: NDArray, length: int) -> NDArray:
+    """Largest of each `length` successive rows [rows - length + 1, col]; in two steps for three rows, in three for five
+    or seven, since the largest of a span follows from those of two shorter spans.
+    """
+    span = 1
+    while span < length:
+        # a span that begins where the other ends, or within it
+        shift = min(span, length - span)
+        image, span = np.maximum(image[: image.shape[0] - shift], image[shift:]), span + shift
+    return image
 
 
 def turns(row: NDArray[np.integer], window: NDArray[np.integer]) -> NDArray[np.int64]:

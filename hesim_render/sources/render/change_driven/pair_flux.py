@@ -137,16 +137,18 @@ class PilotFlux:
         """
         types, rays = jit(), RayStatistics(len(met) // samples, samples, alike)
         dr.eval(controlled, plain, unshadowed, met)
-        results: dict[str, Float | UInt32] = {"unshadowed": rays.mean(unshadowed), "met": rays.any_bits(met)}
-        # both estimators from the same rays; the plan chooses by their scatter
-        for values, name in ((controlled, "controlled"), (plain, "plain")):
-            results[name], results[f"{name}_scatter"] = rays.mean_and_scatter(values, mild)
+        # place of the first ray of each pair among the rays to compare with
+        others: tuple[Float, ...] = ()
+        first = None
         if before is not None:
-            others, pair = before
-            # place of the first ray of each pair among the rays to compare with
-            first = types.UInt32(pair.astype(np.uint32)) * dr.opaque(types.UInt32, samples)
-            for values, other, name in ((controlled, others.controlled, "controlled"), (plain, others.plain, "plain")):
-                results[f"{name}_change"] = rays.change(values, other, first)
+            others = before[0].controlled, before[0].plain
+            first = types.UInt32(before[1].astype(np.uint32)) * dr.opaque(types.UInt32, samples)
+        # both estimators from the same rays; the plan chooses by their scatter
+        means, bits, both, changes = rays.of([unshadowed], met, [controlled, plain], others, first, mild)
+        results: dict[str, Float | UInt32] = {"unshadowed": means[0], "met": bits}
+        for name, (mean, scatter) in zip(("controlled", "plain"), both, strict=True):
+            results[name], results[f"{name}_scatter"] = mean, scatter
+        results.update(zip(CHANGES, changes, strict=False))
         dr.eval(*results.values())
         for name, each in results.items():
             getattr(self, name)[part] = np.array(each)

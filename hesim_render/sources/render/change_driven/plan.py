@@ -34,14 +34,17 @@ def changes(flux: NDArray[np.float32], least: NDArray[np.float32]) -> NDArray[np
     marked = np.zeros(flux.shape, np.bool_)
     # the flux of the last marked window of each site, [site]; windows are compared with it, so that slow drifts add up
     level = flux[0].copy()
+    bound, step = np.empty((2, flux.shape[1]), np.float32)
+    changed = np.empty(flux.shape[1], np.bool_)
     for window in range(1, flux.shape[0]):
         now = flux[window]
         # the noise is that of either window, and the smaller one decides what can be seen
-        bound = np.minimum(least[window - 1], least[window])
-        changed = np.abs(now - level) > bound
+        np.minimum(least[window - 1], least[window], out=bound)
+        np.greater(np.abs(np.subtract(now, level, out=step), out=step), bound, out=changed)
         marked[window] |= changed
         # a sudden step: the line to the marked window would begin too early without the window before it
-        marked[window - 1] |= changed & (np.abs(now - flux[window - 1]) > np.float32(0.5) * bound)
+        np.abs(np.subtract(now, flux[window - 1], out=step), out=step)
+        marked[window - 1] |= changed & (step > np.float32(0.5) * bound)
         np.copyto(level, now, where=changed)
     return marked
 
