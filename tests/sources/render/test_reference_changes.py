@@ -171,7 +171,7 @@ def planned(flux, scatter, change, unshadowed, quality=0.25):
 
 
 def test_the_window_that_needs_most_decides_how_many_rays_its_unit_gets():
-    """By hand, from ε = 0.25·(0.01·F + 5), with F = 1500 and so ε = 5 unless said. Changes are from the third window."""
+    """By hand, from ε = 0.25·(0.01·F + 5), with F = 1500 and so ε = 5 unless said. Changes are from the third one."""
     even, none = [1500.0] * 4, [0.0] * 4
 
     def one(flux, scatter, change, unshadowed, **named):
