@@ -393,17 +393,13 @@ def course():
 
 @pytest.mark.parametrize("scatters", [True, False])
 def test_errors_of_a_target_go_from_its_moments_through_their_slope(monkeypatch, scatters):
-    """Groups left out, simulated pixels, drift, overshoots and pixels that see nearly all, each by its own formula; a
-    spread, or its limit.
-    """
+    """Groups left out, simulated pixels, drift and overshoots, each by its own formula; a spread, or its limit."""
     rng, pixels, period_s, seconds, rise = np.random.default_rng(12), 200, 0.25, 11.0, 1.3
     group = rng.permutation(np.arange(pixels) % GROUPS)
     counts = rng.normal([[320.0], [210.0]], 12.0, (2, pixels))
-    # three more pixels see less than these
-    every = np.append(counts, np.full((2, 3), 70.0), axis=1)
     tally = SimpleNamespace(
-        per_pixel=lambda: every, used=np.ones(pixels + 3, bool), seconds=seconds,
-        group=np.append(group, [1, 2, 3]).astype(np.uint64), period_s=lambda: period_s,
+        per_pixel=lambda: counts, used=np.ones(pixels, bool), seconds=seconds, group=group.astype(np.uint64),
+        period_s=lambda: period_s,
     )  # fmt: skip
     ends, leak_hz, asked = np.array([[0.02, 0.05], [0.07, 0.03]]), 1.7, []
     over = SimpleNamespace(top=np.array([0.2, 0.4]), bottom=np.array([0.1, 0.25]), unsure=0.08, ends=ends)
@@ -427,7 +423,7 @@ def test_errors_of_a_target_go_from_its_moments_through_their_slope(monkeypatch,
         mean = count.mean(axis=1)
         return np.array([*mean, np.mean(count.var(axis=1, ddof=1) / mean**2)])
 
-    monkeypatch.setattr(target, "seen_alike", lambda tally: np.arange(pixels + 3) < pixels)
+    monkeypatch.setattr(target, "seen_alike", lambda tally: tally.used)
     monkeypatch.setattr(target, "_Simulated", Simulated)
     monkeypatch.setattr(target, "_course", lambda *given: asked.append(given) or over)
     found = target.thresholds(tally, np.exp(rise), None, leak_hz)
@@ -443,9 +439,7 @@ def test_errors_of_a_target_go_from_its_moments_through_their_slope(monkeypatch,
 
     simulated = np.linalg.inv(slope) @ root @ root.T @ np.linalg.inv(slope).T
     unsure = 0.08 * np.array([1, 1 / ratio]) / a_cycle.mean(axis=1)
-    partial = 0.06 * (3 / 203) / 0.03
-    errors = np.append(fitted[:2] * unsure, partial * fitted[2])
-    errors = np.sqrt(scatter(left) ** 2 + np.diag(simulated) + errors**2)
+    errors = np.sqrt(scatter(left) ** 2 + np.diag(simulated) + [*(fitted[:2] * unsure) ** 2, (0.06 * fitted[2]) ** 2])
     beyond = ends @ fitted[:2] / (rise + 0.3 * fitted[0] + 0.175 * fitted[1])
     for k, name in enumerate(("theta_on", "theta_off")):
         entry, half = found.entries[name], stats.t.ppf(0.975, 19) * errors[k]
