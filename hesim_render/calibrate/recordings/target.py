@@ -31,8 +31,8 @@ _PIXELS, _WARM, _MOST_CYCLES = 8192, 4, 60
 _LEAST_CYCLES, _LEAST_EVENTS = 3, 1.5
 #: Relative error of the variance of the thresholds, by noise at the rests, or by pixels that see nearly the whole
 #: contrast. They lie beside those that see less: without rests it is as large where so many of the pixels are left out,
-#: smaller in proportion below. Of stars and checkerboards written in NumPy 16 to 40 of 100 are, where all pixels see the
-#: same 0 to 3. In noise the variance scatters by 1.5 times as much as its other errors say.
+#: smaller in proportion below. Of stars and checkerboards written in NumPy 16 to 40 of 100 are, where all pixels see
+#: the same 0 to 3. In noise the variance scatters by 1.5 times as much as its other errors say.
 _PARTIAL, _LEFT_OUT = 0.06, 0.03
 #: Relative difference of the rests of pixels that are taken together; most deviations of a pixel's counts, of those
 #: above the median, and the times that pixels beyond are taken out. Chosen on stars and checkerboards written in NumPy,
