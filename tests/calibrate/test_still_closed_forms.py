@@ -719,6 +719,18 @@ def test_a_lamp_is_told_from_slices_of_two_of_its_periods(periods):
         assert f"a lamp of {min(LAMPS_HZ):g} Hz" in told
 
 
+@pytest.mark.parametrize("fewest", [0, 1])
+def test_a_slice_without_on_events_has_no_phase_of_a_lamp(fewest):
+    """All others have one phase of the slower lamp; a slice of one event is as good as any."""
+    slices = np.zeros((2, SLICES, GROUPS), int)
+    slices[0, :, 0] = 900
+    slices[0, 4, 0] = fewest
+    on = slices[0].sum(axis=1)
+    waves = on * np.exp(0.7j) * np.array([[lamp == min(LAMPS_HZ)] for lamp in LAMPS_HZ])
+    found = stillness.of_a_lamp(SimpleNamespace(slices=slices, seconds=4.0, waves=waves))
+    assert (found is not None) == (fewest > 0)
+
+
 @pytest.mark.parametrize(("contrast", "cycles_hz", "is_right"), [
     (1.001, 0.01, True), (1.0, 3.0, False), (9999.0, None, True), (1e4, None, False), (2.0, 0.0, False),
     (2.0, -3.0, False), (None, 3.0, False),
