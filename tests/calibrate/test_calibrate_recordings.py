@@ -37,8 +37,10 @@ def sensor(seed):
                      shape=SHAPE)
         for lux, part in zip(LUX, (2.6, 3.4, 9.0), strict=True)
     ]  # fmt: skip
+    # the light of the target is another: its leak is that of the still scenes within 10 %, which the intervals hold
+    of_light = 1 + 0.1 * rng.standard_normal()
     moving = target_events(rng, on, off, RISE, hz=5.0, cycles=12, shape=SHAPE, sigma=0.001,
-                           drift=current * (dark + growth * 250.0))  # fmt: skip
+                           drift=of_light * current * (dark + growth * 250.0))  # fmt: skip
     more = 1 + mismatch**2  # mean of 1/θ
     truth = {"theta_on": theta_on, "theta_off": theta_off, "threshold_mismatch_rel": mismatch,
              "threshold_ratio": theta_off / theta_on, "leak_dark_hz": dark * more,

@@ -296,6 +296,23 @@ def test_findings_of_emva_captures_begin_at_their_limits():
     assert "light of the long series" not in named(pairs=other)  # beyond the brightest clear level
 
 
+@pytest.mark.parametrize(("offset", "is_rounded", "cause"), [
+    (9.0, False, "has 9 photons more than stated: an exposure that is longer"),
+    (-9.0, False, "has 9 photons less than stated: an exposure that is shorter"),
+    (2.2, True, "has 2.2 photons more than stated, +0.48 DN: rounding moves a dark level"),
+    (-2.2, True, "has 2.2 photons less than stated, -0.48 DN: rounding moves a dark level"),
+    (2.4, True, "has 2.4 photons more than stated: an exposure that is longer"),
+])  # fmt: skip
+def test_an_offset_of_the_light_is_told_from_a_dark_level_that_is_rounded(offset, is_rounded, cause):
+    """By 0.22 DN a photon: up to half a step of the ADC, where rounding hides the dark noise."""
+    curve = SimpleNamespace(**{**vars(calibration().curve), "offset": offset})
+    curve.terms, curve.offset_error = np.array([0.22, 0.0, 0.0]), 0.1
+    dark = SimpleNamespace(**vars(calibration().dark), least_variance=0.05)
+    found = findings(calibration(curve=curve, dark=dark, dark_noise_is_rounded_off=is_rounded))
+    (text,) = [one.text for one in found if one.check == "light offset"]
+    assert cause in text
+
+
 def test_levels_that_are_off_to_one_side_lie_on_another_curve():
     """Deviations of ten levels with one change of sign, against the same ones with nine."""
     light = np.linspace(100, 900, 10)

@@ -209,6 +209,32 @@ def test_what_is_not_known_of_the_overshoots_is_a_part_of_the_swing_of_the_level
         assert found[name]["interval_95"] == pytest.approx([value - down, value + up], rel=1e-9)
 
 
+@pytest.mark.parametrize(("place", "part", "unsure", "left_out"), [
+    ((9, 19), 1.0, 0.0, 0.0), ((0, 0), 0.5, 0.0, 4 / 199), ((9, 0), 0.0, 0.0, 3 / 198),
+    ((0, slice(None)), 0.5, 0.0, 0.03), ((0, 0), 0.5, 0.1, 0.03),
+])  # fmt: skip
+def test_pixels_that_see_nearly_all_are_as_many_as_those_that_see_less(monkeypatch, place, part, unsure, left_out):
+    """Of 10 by 20 pixels one in a corner, or a row, sees half, and goes with its neighbours. Silent, hot ones are none.
+
+    They are 6 % of the variance of the thresholds where 3 % of the pixels or more are left out; so is noise at rests.
+    """
+    count = np.ones((2, 10, 20)) * np.array([90.0, 60.0])[:, None, None]
+    count[(slice(None), *place)] *= part
+    count = count.reshape(2, 200)
+    one = SimpleNamespace(
+        shape=(10, 20), used=np.arange(200) != 150, per_pixel=lambda: count, same=np.zeros((2, 2, GROUPS, STEPS)),
+        gap_us=np.full((2, 200), 9000), seconds=2.0, group=np.arange(200) % GROUPS,
+    )  # fmt: skip
+    course = target._Course(np.zeros(2), np.zeros(2), (0.0, 0.0), 0.0, np.array([[0.0, 0.0], [0.0, unsure]]))
+    monkeypatch.setattr(target, "_course", lambda *_: course)
+    monkeypatch.setattr(target, "_Simulated", lambda *_: SimpleNamespace(
+        fit=lambda _: (np.array([0.2, 0.25, 0.08**2]), np.eye(3)), moment_covariance=lambda _: np.zeros((3, 3))
+    ))  # fmt: skip
+    found = target.thresholds(one, 8.0, 2.5, 0.0).entries["threshold_mismatch_rel"]
+    assert found["value"] == pytest.approx(0.08)
+    assert found["standard_error"] == pytest.approx(0.08 * 2 * left_out / 2, abs=1e-12)
+
+
 def test_simulated_counts_are_those_of_the_swing_the_overshoots_and_the_drift():
     """A reference is half of a threshold short of the level at either end, on average over its places."""
     over = np.full(target._PIXELS, 0.4), np.full(target._PIXELS, 0.7)

@@ -17,6 +17,8 @@ _LEAST_BEND, _LEAST_SCATTER = 2e-3, 2e-3
 _LEAST_LEVEL_DN = 0.01
 #: Correlation of the deviations of successive levels from which they lie on a curve of their own, and fewest levels.
 _ALIKE, _FEWEST_ALIKE = 0.45, 8
+#: Most by which rounding moves the mean of a level without noise, DN.
+_ROUNDED_DN = 0.5
 #: Missing codes that are listed.
 _MOST_CODES = 6
 #: Standard errors that chance exceeds in one of 10,000 cases.
@@ -37,12 +39,7 @@ def findings(result: PairCalibration) -> list[Finding]:
         )
         outcome.append(("linearity", text))
     if abs(curve.offset) > 4 * curve.offset_error > 0:
-        unit = "photons" if result.pairs.has_photons else "s of exposure"
-        text = (
-            f"every lit frame has {curve.offset:.3g} {unit} more than stated: an exposure that is longer than stated "
-            "by a constant, or light during the read-out (smear)"
-        )
-        outcome.append(("light offset", text))
+        outcome.append(("light offset", _of_the_offset(result)))
     if curve.light_rms > _LEAST_SCATTER / 4:
         amount = f"{100 * curve.light_rms:.2g} %"
         text = f"the light scatters by {amount} from exposure to exposure"
@@ -93,6 +90,25 @@ def findings(result: PairCalibration) -> list[Finding]:
     outcome += _of_lag(result)
     outcome += _of_the_set(result)
     return [Finding(check, text, None) for check, text in outcome]
+
+
+def _of_the_offset(result: PairCalibration) -> str:
+    """What light beyond that of the stated exposures may be. A level that hardly any noise moves is rounded as a whole,
+    while noisy lit frames have their own mean.
+    """
+    curve, unit = result.curve, "photons" if result.pairs.has_photons else "s of exposure"
+    size, more = f"{abs(curve.offset):.3g} {unit}", "more" if curve.offset > 0 else "less"
+    level_dn = float(curve.offset * curve.terms[0])
+    if result.dark_noise_is_rounded_off and abs(level_dn) < _ROUNDED_DN:
+        return (
+            f"every lit frame has {size} {more} than stated, {level_dn:+.2g} DN: rounding moves a dark level with so "
+            "little noise by as much, so that the exposures may well be the stated ones"
+        )
+    if curve.offset > 0:
+        cause = "an exposure that is longer than stated by a constant, or light during the read-out (smear)"
+    else:
+        cause = "an exposure that is shorter than stated by a constant, or dark frames that are brighter than no light"
+    return f"every lit frame has {size} {more} than stated: {cause}"
 
 
 def missing_codes(*levels: Levels) -> list[tuple[str, str]]:
