@@ -46,6 +46,7 @@ def with_overheads(rays: Estimate, sensor: Sensor, demand: Demand, *, audited: b
     if audited and rays.seconds > 0:
         evs = sensor.spec.evs
         most = _MOST_TICK_RAYS if evs is None or evs.reference == "previous_sample" else _MOST_ASYNCHRONOUS_RAYS
+        most = min(most, rays.audit_rays)
         again = min(rays.rays if rests else _AUDIT_RAYS * rays.rays, max(most, _AUDIT_PART * rays.rays))
         seconds += _AUDIT_S + again * rays.seconds / rays.rays
     return replace(rays, seconds=seconds)

@@ -1,5 +1,6 @@
 """What a run asks of its source of flux, what it needs to know of it besides, and the estimate of what a run takes."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -120,12 +121,14 @@ class Estimate:
     peak_bytes : peak memory, bytes.
     rays : total number of rays.
     held_bytes : part of the memory that each part of the light needs anew, bytes.
+    audit_rays : rays of the audit of a short run, if the scene needs fewer than the sensor alone lets expect.
     """
 
     seconds: float
     peak_bytes: float
     rays: float
     held_bytes: float = 0.0
+    audit_rays: float = math.inf
 
     @classmethod
     def together(cls, parts: "Sequence[Estimate]") -> "Estimate":
@@ -135,6 +138,7 @@ class Estimate:
             peak_bytes=parts[0].peak_bytes + sum(part.held_bytes for part in parts[1:]),
             rays=sum(part.rays for part in parts),
             held_bytes=sum(part.held_bytes for part in parts),
+            audit_rays=sum(part.audit_rays for part in parts),
         )
 
     def __str__(self) -> str:

@@ -1,5 +1,7 @@
 """The estimate of a run counts start, noise, frames and audit, not its rays alone; a dry run shows what it does."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -52,6 +54,11 @@ def test_an_audit_costs_rays_at_the_speed_of_the_run():
         for rays in (Estimate(0.5, 7e8, 4e5), RAYS, Estimate(900.0, 7e8, 3e9)):
             again = min(8 * rays.rays, max(most, rays.rays / 16)) / rays.rays * rays.seconds
             assert told(name, rays, audited=True) - told(name, rays) == pytest.approx(0.5 + again)
+    # scenes may need fewer; a long run looks at a sixteenth all the same
+    few = replace(RAYS, audit_rays=1.5e6)
+    assert told("imx636", few, audited=True) - told("imx636", few) == pytest.approx(0.5 + 1.5 / 6 * 3)
+    long = replace(few, rays=6e7)
+    assert told("imx636", long, audited=True) - told("imx636", long) == pytest.approx(0.5 + 3 / 16)
     # what stands still has few values to look at again
     still = told("eiger", audited=True, rests=True) - told("eiger", rests=True)
     assert still == pytest.approx(0.5 + RAYS.seconds)

@@ -36,7 +36,7 @@ class Counted:
     5 of the flux there, 30 of pilots; 64 and 32 in the first anchor.
     """
 
-    is_static, has_ticks, seed, sensor = False, True, 3, None
+    is_static, has_ticks, sees_paths, seed, sensor = False, True, True, 3, None
 
     def __init__(self, constant):
         self.constant = constant

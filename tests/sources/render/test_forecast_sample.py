@@ -1,11 +1,16 @@
 """The pixels of which a forecast counts the rays: squares of a list that may be sparse."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import hesim_render as hr
+from hesim_render.mosaic.schedule import BlockSample
 from hesim_render.sources.render.change_driven import forecast
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.renderer import Demand
 
 
 @pytest.mark.parametrize(("row_step", "col_step"), [(1, 1), (2, 2), (3, 1)])
@@ -32,3 +37,17 @@ def test_pixels_that_lie_apart_are_taken_one_by_one(monkeypatch):
     pixel = np.arange(0, 8000, 8, dtype=np.uint32)
     rng = SimpleNamespace(random=lambda count: np.array([0.0, 0.5, 0.25, 0.875, 0.125]))
     assert forecast._sample(pixel, source, "any", rng).tolist() == [8 * k for k in (0, 300, 450, 775, 825)]
+
+
+@pytest.mark.parametrize(
+    ("scene", "sensor", "least", "most"),
+    [("floor-ball", "davis346", 1e6, 3e7), ("floor-ball", "reference-mono", np.inf, np.inf)],
+)
+def test_only_asynchronous_pixels_that_see_paths_have_short_audits(scene, sensor, least, most):
+    folder = Path(__file__).parents[3] / "benchmarks/scenes"
+    sensor = hr.load_sensor(sensor).crop(8, 6, 30, 20)
+    source = ChangeDrivenFlux(hr.load_scene(folder / f"{scene}.yaml"), sensor)
+    demand = Demand(1000, np.empty(0, np.uint32), BlockSample([], 1.0), np.empty(0, np.uint32), [])
+    assert least <= source.estimate(demand).audit_rays <= most
+    star = ChangeDrivenFlux(hr.load_scene("rotating-star"), sensor)
+    assert star.estimate(demand).audit_rays == np.inf

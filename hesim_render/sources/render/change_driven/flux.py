@@ -92,16 +92,13 @@ class ChangeDrivenFlux:
         if not 0 < quality < float("inf"):
             raise RangeError("quality", quality, "a part of the sensor's noise, above 0")
         self.quality, self.seed, self.light, self._scene = quality, seed, light, scene
-        self._tracer = PairTracer(scene, sensor, seed, used_responses(sensor), progress, light=light)
-        self.view, self.sensor = self._tracer.view, self._tracer.sensor
-        tracer = self._tracer
-        most_power = 1.0 if light is None else light.highest
+        tracer = self._tracer = PairTracer(scene, sensor, seed, used_responses(sensor), progress, light=light)
+        self.view, self.sensor = tracer.view, tracer.sensor
         self.is_static = not tracer.parts.groups and tracer.camera is None
-        noise = Noise(self.sensor, most_power, rests=self.is_static)
+        noise = Noise(self.sensor, 1.0 if light is None else light.highest, rests=self.is_static)
         self._clock = MotionClock(self.view, tracer.camera, tracer.parts.groups, partial(least_depth_m, tracer))
         self._renderer = AdaptiveRenderer(tracer, noise, quality, tuning.at(quality), self._clock)
-        self._index = self._renderer.index
-        self._references = References(self._renderer)
+        self._index, self._references = self._renderer.index, References(self._renderer)
 
     # ---- as a `SceneRenderer` ---------------------------------------------------------------------
 
@@ -173,8 +170,7 @@ class ChangeDrivenFlux:
         pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
         if pixels.size and int(pixels.max()) >= self._index.size:
             raise RangeError("pixel", int(pixels.max()), f"0 to {self._index.size - 1}, inside the region")
-        begin = np.broadcast_to(np.asarray(begin_us, dtype=np.float64), pixels.shape)
-        end = np.broadcast_to(np.asarray(end_us, dtype=np.float64), pixels.shape)
+        begin, end = (np.broadcast_to(np.asarray(t, dtype=np.float64), pixels.shape) for t in (begin_us, end_us))
         if not np.all(end >= begin):
             raise RangeError("end_us - begin_us", float(np.min(end - begin)), "0 or more")
         flux = Flux.zeros(1, pixels.size)
@@ -211,7 +207,6 @@ class ChangeDrivenFlux:
         renderer, windows, rays = self._renderer, Windows(begin_us, end_us), np.zeros(4)
         # what is traced here is no work of the run: its counts are put back at the end
         counts, done = replace(renderer.counts), self._tracer.rays_done
-        later = max(1, windows.size - 1)
         for band in renderer.bands(pixel, role):
             numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.sites.size))
             # of the sites, some are neighbours beyond the patch
@@ -233,7 +228,7 @@ class ChangeDrivenFlux:
             rays[0] += self._tracer.rays_done - before
             # the first window of a block belongs to the block before
             todo = what.rendered.copy()
-            todo[:-later] = False
+            todo[: -max(1, windows.size - 1)] = False
             if anchor is not None:
                 rays[:3] += anchor.rays_of(what, todo)
             todo &= what.differences.rays == 0
@@ -266,6 +261,11 @@ class ChangeDrivenFlux:
     def has_ticks(self) -> bool:
         """True if event pixels compare at a fixed tick."""
         return self._renderer.has_ticks
+
+    @property
+    def sees_paths(self) -> bool:
+        """True if not all visible light is direct light on diffuse surfaces."""
+        return not self._tracer.is_diffuse
 
     def is_apart(self, role: Role) -> bool:
         """True if pixels of a role have no direct neighbours of that role."""

@@ -24,6 +24,9 @@ _BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 14, 110, 60
 #: Time of plans, statistics and copies for each ray, beside that of tracing it, s: of `rotating-star` on `davis346` and
 #: `eiger` and `camera-sweep` on `gen2`, 0.02 s each, on two threads of an AVX-512 server.
 _BESIDE_S = 33e-9
+#: Rays of an audit of asynchronous pixels that see paths, which looks at changes: the median of five scenes of light
+#: that bounces (`benchmarks/rows.py`), 0.02 s on `davis346`.
+_PATH_AUDIT_RAYS = 13e6
 
 
 def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
@@ -85,6 +88,7 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         peak_bytes=_BASE_BYTES + held + _EVENT_BYTES * event_pixel.size + _FRAME_BYTES * demand.frame_pixel.size,
         rays=rays,
         held_bytes=held,
+        audit_rays=_PATH_AUDIT_RAYS if source.sees_paths and not source.has_ticks else float("inf"),
     )
 
 
