@@ -605,9 +605,13 @@ def test_intervals_hold_the_truth_of_six_sensors(name):
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth_of_a_hundred_sensors():
-    """Each with a bandwidth, a noise and a target of its own."""
+    """Each with a bandwidth, a noise and a target of its own.
+
+    The intervals of thresholds allow for an error of 5 % of the law of late events, and this generator follows the law:
+    they may hold the truth in all. Mismatch and ratio have no such part.
+    """
     outcome = np.concatenate([
         judged(of, recordings(of, seed, 1)) for seed in range(20280301, 20280401) for of in (a_sensor(seed),)
     ])  # fmt: skip
     hits = outcome[..., 0].sum(axis=0)
-    assert np.all((hits >= 90) & (hits <= 99)), hits
+    assert hits.min() >= 90 and hits[2:].max() <= 99, hits
