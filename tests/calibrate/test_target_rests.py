@@ -603,15 +603,23 @@ def test_intervals_hold_the_truth_of_six_sensors(name):
     assert abs(outcome[:, :2, 1].mean()) < 0.07
 
 
-@pytest.mark.slow
-def test_intervals_hold_the_truth_of_a_hundred_sensors():
-    """Each with a bandwidth, a noise and a target of its own.
-
-    The intervals of thresholds allow for an error of 5 % of the law of late events, and this generator follows the law:
-    they may hold the truth in all. Mismatch and ratio have no such part.
-    """
+@pytest.fixture(scope="module")
+def hits_of_a_hundred_sensors():
+    """Each with a bandwidth, a noise and a target of its own."""
     outcome = np.concatenate([
         judged(of, recordings(of, seed, 1)) for seed in range(20280301, 20280401) for of in (a_sensor(seed),)
     ])  # fmt: skip
-    hits = outcome[..., 0].sum(axis=0)
-    assert hits.min() >= 90 and hits[2:].max() <= 99, hits
+    return outcome[..., 0].sum(axis=0)
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth_of_a_hundred_sensors(hits_of_a_hundred_sensors):
+    """Thresholds, mismatch and ratio; the last two are no wider than they have to be."""
+    assert hits_of_a_hundred_sensors.min() >= 90 and hits_of_a_hundred_sensors[2:].max() <= 99
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(reason="θ₋ is held in 100: intervals allow for an error of the law of late events, 5 %", strict=True)
+def test_intervals_of_thresholds_are_no_wider_than_they_have_to_be(hits_of_a_hundred_sensors):
+    """This generator follows the law of late events, so that the allowance for its error is not used."""
+    assert hits_of_a_hundred_sensors[:2].max() <= 99

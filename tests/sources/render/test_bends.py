@@ -9,6 +9,7 @@ import pytest
 
 import hesim_render as hr
 from hesim_render.core.rng import Stream
+from hesim_render.sources.render.change_driven import adaptive
 from hesim_render.sources.render.change_driven.bends import polyline, straightened
 from hesim_render.sources.render.change_driven.differences import Differences
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
@@ -152,8 +153,6 @@ def test_a_turning_mesh_takes_fewer_rays_for_the_same_errors():
 
 @pytest.mark.parametrize("scene", ["rotating-star"])
 def test_direct_light_keeps_its_windows(monkeypatch, scene):
-    from hesim_render.sources.render.change_driven import adaptive
-
     monkeypatch.setattr(adaptive, "straightened", lambda *_: pytest.fail("lines know edges better"))
     source = ChangeDrivenFlux(hr.load_scene(scene), hr.load_sensor("davis346").crop(8, 6, 160, 120))
     blocks = list(source.sample_blocks(1, 0.0, 2000.0))
@@ -161,8 +160,6 @@ def test_direct_light_keeps_its_windows(monkeypatch, scene):
 
 
 def test_the_estimate_of_a_block_knows_of_bends_and_that_of_a_window_does_not(monkeypatch):
-    from hesim_render.sources.render.change_driven import adaptive
-
     source = ChangeDrivenFlux(hr.load_scene(KNOT), hr.load_sensor("davis346").crop(5, 4, 162, 118))
     pixel = source.sensor.layout.evs_pixel.ravel()
     (block, *_) = (b for b in source.sample_blocks(1, 0.0, 12_000.0) if b.wanted.size > 2)

@@ -79,8 +79,9 @@ class References:
             if some.size and is_level:
                 values[:, row, col] = self.values(index[col], begin_us[row, col], end_us[row, col], quality, "events")
             elif some.size:
-                rays, times = self._rays_of(index[col], begin_us[:, col], end_us[:, col], base, quality)
-                values[:, row, col] = self._traced(index[col], begin_us[row, col], end_us[row, col], rays, times)
+                own, place = np.unique(col, return_inverse=True)
+                rays = self._rays_of(index[own], begin_us[:, own], end_us[:, own], base, quality)[:, place]
+                values[:, row, col] = self._traced(index[col], begin_us[row, col], end_us[row, col], *rays)
         return values
 
     def _is_aimed(
@@ -107,13 +108,10 @@ class References:
         pairs = np.stack([index.astype(np.float64), begin_us, end_us, rays, times])
 
         def traced(new: NDArray[np.int64]) -> NDArray[np.float64]:
-            # each pair once, however often it was drawn; `place` leads back to the draws
-            every, place = np.unique(pairs[:, new], axis=1, return_inverse=True)
-            span, which = distinct_columns(every[1:3])
-            own = every[0].astype(np.uint32), which, Windows(span[0], span[1]), every[3].astype(np.int64)
+            span, which = distinct_columns(pairs[1:3, new])
+            own = index[new], which, Windows(span[0], span[1]), rays[new].astype(np.int64)
             is_controlled = np.zeros(which.size, np.bool_)
-            got = traced_repeatedly(self._renderer.tracer, own, is_controlled, every[4].astype(np.int64))
-            return np.asarray(got[:, place.ravel()])
+            return traced_repeatedly(self._renderer.tracer, own, is_controlled, times[new].astype(np.int64))
 
         return self._changes.values(pairs, traced)
 
@@ -129,9 +127,7 @@ class References:
         asked = np.stack([index.astype(np.float64), begin_us[base], begin_us[0], end_us[-1], 0 * end_us[0] + quality])
 
         def planned(new: NDArray[np.int64]) -> NDArray[np.float64]:
-            _, first, place = np.unique(asked[:, new], axis=1, return_index=True, return_inverse=True)
-            some = new[first]
-            return self._planned(index[some], begin_us[:, some], end_us[:, some], base, quality)[:, place.ravel()]
+            return self._planned(index[new], begin_us[:, new], end_us[:, new], base, quality)
 
         return self._rays.values(asked, planned)
 

@@ -51,7 +51,11 @@ class KnownPairs:
         if self._hash.size:
             is_known = np.all(self._pairs[:, place] == pairs, axis=0)
         new = np.flatnonzero(~is_known)
-        got = traced(new) if new.size else self._values[:, :0]
+        got = self._values[:, :0]
+        if new.size:
+            # each pair once, however often it is listed; `back` leads to the list
+            _, first, back = np.unique(pairs[:, new], axis=1, return_index=True, return_inverse=True)
+            got = traced(new[first])[:, back.ravel()]
         values = np.empty((got.shape[0], hashed.size))
         if self._hash.size:
             values[:, is_known] = self._values[:, place[is_known]]
