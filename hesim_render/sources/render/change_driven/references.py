@@ -1,4 +1,4 @@
-"""References of the audit: pairs rendered again, and changes of event pixels that see paths.
+"""References of the audit: pairs rendered again, and changes of asynchronous pixels that see paths.
 
 The noise of paths is mostly that of light which stays as it is. Rays with the same random numbers have the same error
 of it in all windows of a pixel, as long as there are equally many, and then it drops out of changes of ln x. So all
@@ -70,10 +70,12 @@ class References:
         quality: float,
     ) -> NDArray[np.float64]:
         """See `AuditableFlux.reference_changes`; of [unit] pixels by their numbers on the full sensor."""
-        tracer, values = self._renderer.tracer, np.zeros((2, *needed.shape))
+        renderer, values = self._renderer, np.zeros((2, *needed.shape))
         window, unit = np.nonzero(needed)
-        # closed forms make direct light exact, and lines the edges, so that levels are known well enough anyway
-        by_level = np.ones(index.size, np.bool_) if tracer.is_diffuse else self._is_aimed(index, begin_us, end_us)
+        # Closed forms make direct light exact, and lines the edges, so that levels are known well enough anyway. From
+        # tick to tick so much moves that changes would take more rays than levels.
+        is_level_known = renderer.tracer.is_diffuse or renderer.has_ticks
+        by_level = np.ones(index.size, np.bool_) if is_level_known else self._is_aimed(index, begin_us, end_us)
         for some, is_level in ((np.flatnonzero(by_level[unit]), True), (np.flatnonzero(~by_level[unit]), False)):
             row, col = window[some], unit[some]
             if some.size and is_level:
