@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hesim_render.sources.render.change_driven.change_detector import Wanted, least_change
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
 from hesim_render.sources.render.change_driven.pair_flux import CHANGES, STATISTICS, PilotFlux
+from hesim_render.sources.render.change_driven.sample_instants import STEP_PX
 
 
 class Looks:
@@ -65,7 +66,7 @@ class Looks:
         for window in range(1, self._last):
             self._keep(window, window - 1, ~marked[window])
 
-    def every(self, stride: int, sites: Sites, wanted: Wanted | None) -> None:
+    def every(self, stride: int, sites: Sites, wanted: Wanted | None, margin_px: float) -> None:
         """Look in every so many windows, then half way between two looks that differ, and so on, after `at_end`.
 
         Parameters
@@ -73,6 +74,8 @@ class Looks:
         stride : windows from one look to the next.
         sites : the sites; what shows the same in two looks, in all sites around, has kept its light between them.
         wanted : wanted error of each site; needed where `stride` is above 1.
+        margin_px : how far a look goes beyond its pixel. What comes into the pixel and leaves it between two looks that
+            are so close that it can not come further is seen by these themselves, and no site around is asked.
         """
         # coarse looks, then halves of those spans whose ends differ
         looks = [*range(0, self._last, stride), self._last]
@@ -81,8 +84,10 @@ class Looks:
         while spans:
             windows, places = [], []
             for early, late in spans:
-                # what comes from two pixels away takes the whole stride
+                # what comes from two pixels away takes the whole stride; it comes and goes within half the time
                 radius = REACH - 1 if 2 * (late - early) > stride else 1
+                if 0.5 * (late - early) * STEP_PX <= margin_px:
+                    radius = 0
                 busy = np.flatnonzero(sites.near(self._differ(early, late, wanted), radius) & self._near)
                 # until a look says otherwise, all windows between show what the early one does
                 for between in range(early + 1, late):

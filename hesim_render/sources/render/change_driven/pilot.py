@@ -222,7 +222,7 @@ def take_pilot(
             of = tracer, sites, numbers, windows, first, near, wanted, width_px, mild
             looks.wherever(windows_with_changes(*of, shadows[0], few_stride))
         else:
-            looks.every(stride, sites, wanted)
+            looks.every(stride, sites, wanted, 0.5 * (width_px - 1))
     # statistics of all windows, [window, site]
     tables = [looks.tables[name] for name in STATISTICS]
     pilot = Pilot(tables[0], tables[1], tables[2], tables[3], tables[4])
