@@ -19,8 +19,9 @@ _BENT_STEP_S, _BENT_STEP_PIXEL_S = 2.5e-3, 0.035e-6
 #: A frame, and a pixel of a frame, through noise and into its file, s.
 _FRAME_S, _FRAME_PIXEL_S = 2e-2, 60e-9
 #: Rays of an audit: a multiple of the run's own, and at most so many for pixels with a tick and for asynchronous ones,
-#: whose units have ten windows, or this part of the run's own; and its start, s.
-_AUDIT_RAYS, _MOST_TICK_RAYS, _MOST_ASYNCHRONOUS_RAYS, _AUDIT_PART, _AUDIT_S = 8.0, 8e6, 24e6, 0.0625, 0.5
+#: whose units have ten windows, or this part of the run's own; its traces, and its start, s.
+_AUDIT_RAYS, _MOST_TICK_RAYS, _MOST_ASYNCHRONOUS_RAYS, _AUDIT_PART = 8.0, 8e6, 24e6, 0.0625
+_AUDIT_TRACES, _AUDIT_S = 100, 0.5
 
 
 def with_overheads(rays: Estimate, sensor: Sensor, demand: Demand, *, audited: bool, rests: bool) -> Estimate:
@@ -48,7 +49,7 @@ def with_overheads(rays: Estimate, sensor: Sensor, demand: Demand, *, audited: b
         most = _MOST_TICK_RAYS if evs is None or evs.reference == "previous_sample" else _MOST_ASYNCHRONOUS_RAYS
         most = min(most, rays.audit_rays)
         again = min(rays.rays if rests else _AUDIT_RAYS * rays.rays, max(most, _AUDIT_PART * rays.rays))
-        seconds += _AUDIT_S + again * rays.seconds / rays.rays
+        seconds += _AUDIT_S + again * rays.ray_s + _AUDIT_TRACES * rays.trace_s
     return replace(rays, seconds=seconds)
 
 

@@ -122,6 +122,8 @@ class Estimate:
     rays : total number of rays.
     held_bytes : part of the memory that each part of the light needs anew, bytes.
     audit_rays : rays of the audit of a short run, if the scene needs fewer than the sensor alone lets expect.
+    ray_s : time of a single ray of the picture, s.
+    trace_s : time to start a trace of any number of rays, s.
     """
 
     seconds: float
@@ -129,6 +131,8 @@ class Estimate:
     rays: float
     held_bytes: float = 0.0
     audit_rays: float = math.inf
+    ray_s: float = 0.0
+    trace_s: float = 0.0
 
     @classmethod
     def together(cls, parts: "Sequence[Estimate]") -> "Estimate":
@@ -139,6 +143,8 @@ class Estimate:
             rays=sum(part.rays for part in parts),
             held_bytes=sum(part.held_bytes for part in parts),
             audit_rays=sum(part.audit_rays for part in parts),
+            ray_s=max(part.ray_s for part in parts),
+            trace_s=max(part.trace_s for part in parts),
         )
 
     def __str__(self) -> str:

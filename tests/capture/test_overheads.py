@@ -11,7 +11,7 @@ from hesim_render.capture.overheads import noise_seconds, with_overheads
 from hesim_render.mosaic.schedule import Block, BlockSample, Exposure
 from hesim_render.sources.renderer import Demand, Estimate
 
-RAYS = Estimate(seconds=3.0, peak_bytes=7e8, rays=6e6)
+RAYS = Estimate(seconds=3.0, peak_bytes=7e8, rays=6e6, ray_s=4.3e-7, trace_s=0.031)
 RUN = {"windows": 130.0, "frames": 0, "audited": False, "rests": False}
 
 
@@ -49,19 +49,21 @@ def test_steps_go_to_windows_and_to_nodes_of_the_noise():
     assert noise_seconds(hr.load_sensor("reference-bayer"), 50_000, 0.0, rests=False) == 0
 
 
-def test_an_audit_costs_rays_at_the_speed_of_the_run():
+def test_an_audit_costs_rays_at_the_speed_of_the_picture_and_traces():
+    """A small audit starts a hundred traces, however few rays each has."""
     for name, most in (("imx636", 24e6), ("eiger", 8e6), ("reference-bayer", 8e6)):
-        for rays in (Estimate(0.5, 7e8, 4e5), RAYS, Estimate(900.0, 7e8, 3e9)):
-            again = min(8 * rays.rays, max(most, rays.rays / 16)) / rays.rays * rays.seconds
-            assert told(name, rays, audited=True) - told(name, rays) == pytest.approx(0.5 + again)
+        for rays in (replace(RAYS, seconds=0.5, rays=4e5), RAYS, replace(RAYS, seconds=900.0, rays=3e9)):
+            again = min(8 * rays.rays, max(most, rays.rays / 16))
+            cost = told(name, rays, audited=True) - told(name, rays)
+            assert cost == pytest.approx(0.5 + 100 * 0.031 + again * 4.3e-7)
     # scenes may need fewer; a long run looks at a sixteenth all the same
     few = replace(RAYS, audit_rays=1.5e6)
-    assert told("imx636", few, audited=True) - told("imx636", few) == pytest.approx(0.5 + 1.5 / 6 * 3)
+    assert told("imx636", few, audited=True) - told("imx636", few) == pytest.approx(3.6 + 1.5e6 * 4.3e-7)
     long = replace(few, rays=6e7)
-    assert told("imx636", long, audited=True) - told("imx636", long) == pytest.approx(0.5 + 3 / 16)
+    assert told("imx636", long, audited=True) - told("imx636", long) == pytest.approx(3.6 + 6e7 / 16 * 4.3e-7)
     # what stands still has few values to look at again
     still = told("eiger", audited=True, rests=True) - told("eiger", rests=True)
-    assert still == pytest.approx(0.5 + RAYS.seconds)
+    assert still == pytest.approx(3.6 + 6e6 * 4.3e-7)
     nothing = Estimate(0.0, 7e8, 0.0)
     assert told("eiger", nothing, audited=True) == told("eiger", nothing)
 

@@ -174,11 +174,12 @@ class RenderedFlux(WindowByWindow):
                     for e in some
                 ]
                 values += demand.frame_pixel.size * len(exposures) * float(np.mean(slices))
-        rays = values * self.samples
+        rays, ray_s = values * self.samples, 1 / self._rays_per_second(demand.pixels)
         return Estimate(
-            seconds=rays / self._rays_per_second(demand.pixels),
+            seconds=rays * ray_s,
             peak_bytes=_BASE_BYTES + _PIXEL_BYTES * (demand.frame_pixel.size + events),
             rays=rays,
+            ray_s=ray_s,
         )
 
     def _rays_per_second(self, every: NDArray[np.uint32]) -> float:

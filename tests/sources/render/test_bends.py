@@ -121,11 +121,11 @@ def values_of(seconds, cols, rows, tuning=TUNING):
     return source, wins, np.array(flux, np.float64)
 
 
-def test_no_value_depends_on_the_end_of_the_run_and_half_of_the_rays_are_left():
-    source, _, flux = values_of(0.012, 5, 4)
-    _, _, short = values_of(0.007, 5, 4)
+def test_no_value_depends_on_the_end_of_the_run_and_a_third_of_the_rays_is_saved():
+    source, _, flux = values_of(0.012, 7, 5)
+    _, _, short = values_of(0.007, 7, 5)
     np.testing.assert_array_equal(short, flux[: len(short)])
-    every, _, _ = values_of(0.012, 5, 4, replace(TUNING, bend_gain=1e9))
+    every, _, _ = values_of(0.012, 7, 5, replace(TUNING, bend_gain=1e9))
     assert source.counts.rays < 0.7 * every.counts.rays
     # looks count as rays of the picture
     assert source.counts.rays + source.counts.pilot_rays == source.rays_traced
@@ -163,13 +163,13 @@ def test_the_estimate_of_a_block_knows_of_bends_and_that_of_a_window_does_not(mo
     source = ChangeDrivenFlux(hr.load_scene(KNOT), hr.load_sensor("davis346").crop(5, 4, 162, 118))
     pixel = source.sensor.layout.evs_pixel.ravel()
     (block, *_) = (b for b in source.sample_blocks(1, 0.0, 12_000.0) if b.wanted.size > 2)
-    rays = source.foretell(pixel, block.begin_us, block.end_us, "events")[0]
+    rays = source.foresight.block(pixel, block.begin_us, block.end_us, "events").rays[0]
     asked = []
     monkeypatch.setattr(
         adaptive, "straightened", lambda tracer, index, windows, what, tuning: (asked.append(1), what)[1]
     )
-    assert rays < 0.7 * source.foretell(pixel, block.begin_us, block.end_us, "events")[0] and asked
+    assert rays < 0.7 * source.foresight.block(pixel, block.begin_us, block.end_us, "events").rays[0] and asked
     asked.clear()
-    source.foretell(pixel, block.begin_us[:1], block.end_us[:1], "events")
-    source.foretell(pixel, block.begin_us[:1], block.end_us[:1], "any")
+    source.foresight.block(pixel, block.begin_us[:1], block.end_us[:1], "events")
+    source.foresight.block(pixel, block.begin_us[:1], block.end_us[:1], "any")
     assert not asked

@@ -1,5 +1,7 @@
 """Forecasts of the rays of a run from a sample of its pixels."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from hesim_render.mosaic.schedule import BlockSample, tick_blocks
 from hesim_render.sources.render.change_driven import forecast
 from hesim_render.sources.render.change_driven.anchor import anchor_us
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.foresight import Foretold, Speed
 from hesim_render.sources.renderer import Demand
 
 
@@ -23,7 +26,7 @@ def test_samples_of_pixels_have_the_rays_of_all(scene, sensor, region, duration_
     block = next(iter(source.sample_blocks(tick_us or 100, 0, duration_us)))
 
     def rays(of):
-        return source.foretell(of, block.begin_us, block.end_us, "events")[[0, 3]].sum()
+        return source.foresight.block(of, block.begin_us, block.end_us, "events").rays[[0, 3]].sum()
 
     samples = [forecast._sample(pixels, source, "events", np.random.default_rng(seed)) for seed in range(5)]
     assert max(part.size for part in samples) < 0.5 * pixels.size
@@ -33,13 +36,13 @@ def test_samples_of_pixels_have_the_rays_of_all(scene, sensor, region, duration_
 
 class Counted:
     """A renderer of 800 pixels of which some may change: 70 rays of each in a block, 20 to compare with in its anchor,
-    5 of the flux there, 30 of pilots; 64 and 32 in the first anchor.
+    5 of the flux there, 30 of pilots; 64 and 32 in the first anchor. Seven traces a block. It looks ahead by itself.
     """
 
     is_static, has_ticks, sees_paths, seed, sensor = False, True, True, 3, None
 
     def __init__(self, constant):
-        self.constant = constant
+        self.constant, self.foresight = constant, self
 
     def may_change(self, pixel, begin_us, end_us):
         return pixel >= self.constant * pixel.size
@@ -47,11 +50,13 @@ class Counted:
     def is_apart(self, role):
         return True
 
-    def foretell(self, pixel, begin_us, end_us, role, until=None, is_anchor=False):
-        return np.array([64.0, 0, 0, 32]) if is_anchor else np.array([70.0, 20, 5, 30])
+    def block(self, pixel, begin_us, end_us, role, until=None, is_anchor=False):
+        if is_anchor:
+            return Foretold(np.array([64.0, 0, 0, 32]), 3.0)
+        return Foretold(np.array([70.0, 20, 5, 30]), 7.0)
 
-    def rays_per_second(self):
-        return 1e7
+    def speed(self):
+        return Speed(picture_ray_s=3e-6, pilot_ray_s=2e-6, start_s=0.04)
 
 
 @pytest.mark.parametrize(("constant", "saved"), [(0.0, 32), (0.003, 32), (0.01, 0)])
@@ -67,7 +72,15 @@ def test_the_first_pilot_goes_on_where_nearly_all_pixels_may_change(constant, sa
         blocks[0].end_us[0],
     )
     each = 96 + alive * ((0 if first_is_anchor else 70) - saved + 20 + (70 + 30) * len(blocks))
-    assert forecast.forecast(source, demand).rays == pytest.approx(800 * each)
+    estimate = forecast.forecast(source, demand)
+    assert estimate.rays == pytest.approx(800 * each)
+    # rays of pilots, which cost less than those of the picture where these are; and traces, for 800 pixels at a time
+    looks = 800 * (32 + alive * (30 * len(blocks) - saved))
+    seconds = 3e-6 * (800 * each - looks) + 2e-6 * looks + 33e-9 * 800 * each + 0.04 * 7 * len(blocks)
+    assert estimate.seconds == pytest.approx(seconds)
+    assert estimate.ray_s == pytest.approx(3.033e-6) and estimate.trace_s == 0.04
+    many = replace(demand, event_pixel=np.arange(3 << 17, dtype=np.uint32))
+    assert forecast.forecast(source, many).seconds > 0.04 * 7 * len(blocks) * 2 + 3e-6 * 64 * (3 << 17)
 
 
 #: A plate flies past one corner of the picture; most of the wall never sees it.
@@ -97,3 +110,34 @@ def test_what_never_changes_is_counted_once(tmp_path):
     )
     render = recording.manifest["settings"]["render"]
     np.testing.assert_allclose(estimates[0].rays, render["rays"] + render["pilot_rays"], rtol=0.2)
+
+
+def test_the_speed_is_that_of_the_pairs_with_most_rays():
+    """Rays of the picture are timed where its rays are, each pair as often as it has rays; nothing of it counts."""
+    source = ChangeDrivenFlux(hr.load_scene("rotating-star"), hr.load_sensor("davis346").crop(24, 18, 150, 110), seed=6)
+    tracer, ahead, seen = source._tracer, source.foresight, []
+    trace = tracer.trace
+
+    def noted(pixel, window, windows, samples, *rest):
+        seen.append((pixel, windows.begin_us[window], samples))
+        return trace(pixel, window, windows, samples, *rest)
+
+    tracer.trace = noted
+    pixel = source.sensor.layout.evs_pixel.ravel()
+    (block, *_) = (b for b in source.sample_blocks(1, 0, 2000) if b.wanted.size > 2)
+    traces = tracer.traces
+    foretold = ahead.block(pixel, block.begin_us, block.end_us, "events")
+    # the picture is not traced, but it counts
+    assert 4 < foretold.traces == tracer.traces - traces - 1 + 4
+    pairs = ahead._pairs[-1]
+    assert not seen and 0.5 * foretold.rays[0] * pixel.size < pairs[3].sum() <= foretold.rays[0] * pixel.size
+    speed = ahead.speed()
+    assert 0 < speed.picture_ray_s < 1e-4 and 0 < speed.pilot_ray_s < 1e-4 and 0 < speed.start_s < 5
+    assert source.rays_traced == source.counts.rays == 0 and not ahead._pairs
+    few, even, busy = seen[2], seen[5], seen[8]
+    assert few[0].size == 8 and even[0].size == 24 * 18 and busy[0].size == 8192 and (busy[2] == 64).all()
+    most = np.argmax(pairs[3])
+    times = np.sum((busy[0] == pairs[0][most]) & (busy[1] == pairs[1][most]))
+    assert times == pytest.approx(8192 * pairs[3][most] / pairs[3].sum(), abs=1)
+    # without any pairs, all rays are those of the whole region
+    assert ahead.speed().picture_ray_s == pytest.approx(ahead.speed().pilot_ray_s, rel=3)

@@ -72,7 +72,6 @@ class Audit:
     ) -> None:
         self._noted, self._source, self._quality, self._noise = noted, source, quality, noise
         #: Places of mosaic indices on the event grid.
-        #: Places of mosaic indices on the event grid.
         self._place_of = np.zeros(int(event_pixel.max(initial=0)) + 1, np.int64)
         self._place_of[event_pixel] = np.arange(event_pixel.size)
         self._rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, 2]))

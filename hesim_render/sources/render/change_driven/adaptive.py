@@ -27,7 +27,7 @@ from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
 
 #: Pixels that are processed at a time, to bound memory.
-_BAND_PIXELS = 1 << 17
+BAND_PIXELS = 1 << 17
 _ALWAYS_US = (-np.inf, np.inf)
 #: Part of the wanted error below which a flux counts as no light at all.
 _NOTHING = np.float32(1e-3)
@@ -93,8 +93,8 @@ class AdaptiveRenderer:
         quality, mild = self.quality, self.tracer.is_diffuse and (apart or not self.has_ticks)
         if role == "any":
             rays, quality, mild = tuning.frame_pilot_rays, quality / tuning.frame_margin, False
-        for first in range(0, order.size, _BAND_PIXELS):
-            place = order[first : first + _BAND_PIXELS]
+        for first in range(0, order.size, BAND_PIXELS):
+            place = order[first : first + BAND_PIXELS]
             # a single window is not followed through time, and needs no pixels beside those that lie apart
             if lattice is None or (apart and role == "any"):
                 sites = Sites.alone(index[place])

@@ -6,9 +6,7 @@ which windows of a pixel are interpolated (`plan`). Values that were rendered be
 time only: they would come out the same again.
 """
 
-import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -23,18 +21,16 @@ from hesim_render.mosaic.schedule import Block, blocks_of_run
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.protocol import AuditableFlux, Sample
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
-from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Counts, Flux
 from hesim_render.sources.render.change_driven.event_blocks import INTERVALS, BlockFlux, Blocks
 from hesim_render.sources.render.change_driven.forecast import forecast
-from hesim_render.sources.render.change_driven.neighbours import REACH
+from hesim_render.sources.render.change_driven.foresight import Foresight
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.references import References
 from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
 from hesim_render.sources.render.change_driven.sample_instants import MotionClock
 from hesim_render.sources.render.change_driven.tuning import TUNING, Tuning
-from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.exact import require_finite, used_responses
 from hesim_render.sources.render.renderer import reported
 from hesim_render.sources.renderer import Demand, Estimate
@@ -69,6 +65,7 @@ class ChangeDrivenFlux:
     sensor : the sensor, with the lens in use.
     view : the placed camera.
     is_static : True where nothing moves.
+    foresight : looks ahead at a run.
 
     Raises
     ------
@@ -99,6 +96,7 @@ class ChangeDrivenFlux:
         self._clock = MotionClock(self.view, tracer.camera, tracer.parts.groups, partial(least_depth_m, tracer))
         self._renderer = AdaptiveRenderer(tracer, noise, quality, tuning.at(quality), self._clock)
         self._index, self._references = self._renderer.index, References(self._renderer)
+        self.foresight = Foresight(self._renderer, self._is_dark)
 
     # ---- as a `SceneRenderer` ---------------------------------------------------------------------
 
@@ -182,81 +180,6 @@ class ChangeDrivenFlux:
 
     # ---- for the forecast -------------------------------------------------------------------------
 
-    def foretell(
-        self,
-        pixel: NDArray[np.uint32],
-        begin_us: NDArray[np.float64],
-        end_us: NDArray[np.float64],
-        role: Role,
-        until: int | None = None,
-        is_anchor: bool = False,
-    ) -> NDArray[np.float64]:
-        """Rays per listed pixel for a block of windows without its first one, or for a single window; in its anchor, to
-        compare with; those of the flux there; and those of pilots in the block.
-
-        Parameters
-        ----------
-        pixel : [n], mosaic indices.
-        begin_us, end_us : [w], the windows, µs.
-        role : use of the pixels.
-        until : number of the last window on whose values something depends; None for the last one.
-        is_anchor : True for an anchor, which is compared with nothing.
-        """
-        if self._is_dark or pixel.size == 0:
-            return np.zeros(4)
-        renderer, windows, rays = self._renderer, Windows(begin_us, end_us), np.zeros(4)
-        # what is traced here is no work of the run: its counts are put back at the end
-        counts, done = replace(renderer.counts), self._tracer.rays_done
-        for band in renderer.bands(pixel, role):
-            numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.sites.size))
-            # of the sites, some are neighbours beyond the patch
-            share, before = band.place.size / band.sites.size, renderer.counts.pilot_rays
-            is_compared = role == "events" and not is_anchor
-            anchor = Anchor(renderer, band, anchor_us(begin_us, end_us, renderer.has_ticks)) if is_compared else None
-            rays[1] += share * (renderer.counts.pilot_rays - before)
-            before = renderer.counts.pilot_rays
-            against = () if anchor is None else (anchor.pilot, renderer.look_stride)
-            pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, *against)
-            rays[3] += share * (renderer.counts.pilot_rays - before)
-            # the same plan as in a run, of which the rays are counted and not traced
-            before, fit = self._tracer.rays_done, None
-            block = windows if role == "events" and windows.size > 1 else None
-            what = renderer.plan(pilot, band, is_knot=role == "events", windows=block)
-            what = what.until(windows.size - 1 if until is None else until)
-            if windows.size > 1:
-                what, fit, *_ = renderer.follow(band, windows, numbers[:, : band.place.size], what)
-            rays[0] += self._tracer.rays_done - before
-            # the first window of a block belongs to the block before
-            todo = what.rendered.copy()
-            todo[: -max(1, windows.size - 1)] = False
-            if anchor is not None:
-                rays[:3] += anchor.rays_of(what, todo)
-            todo &= what.differences.rays == 0
-            window, place = np.nonzero(todo)
-            aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
-            before = self._tracer.rays_done
-            each, _ = renderer.rays_of((band.index[place], window, windows), what, todo, aims, fit)
-            rays[0] += int(each.sum(dtype=np.int64)) + self._tracer.rays_done - before
-        renderer.counts, self._tracer.rays_done = counts, done
-        return rays / pixel.size
-
-    def may_change(
-        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64]
-    ) -> NDArray[np.bool_]:
-        """Event pixels [n] near which a moving object may come at any time, as the pilot of a window says; all others
-        are rendered once.
-        """
-        renderer, windows = self._renderer, Windows(begin_us, end_us)
-        always_us, near_by = renderer.still("events").span_us, np.ones(pixel.size, np.bool_)
-        if self._is_dark or always_us is None:
-            return near_by
-        counts, done = replace(renderer.counts), self._tracer.rays_done
-        for band in renderer.bands(pixel, "events"):
-            _, near = renderer.pilot(band, windows, np.zeros((1, band.sites.size), np.int64), always_us)
-            near_by[band.place] = band.sites.most(near, REACH)
-        renderer.counts, self._tracer.rays_done = counts, done
-        return near_by
-
     @property
     def has_ticks(self) -> bool:
         """True if event pixels compare at a fixed tick."""
@@ -270,22 +193,6 @@ class ChangeDrivenFlux:
     def is_apart(self, role: Role) -> bool:
         """True if pixels of a role have no direct neighbours of that role."""
         return self._renderer.noise.is_apart(role)
-
-    def rays_per_second(self) -> float:
-        """Measured speed of the tracer on this machine, over pixels from the whole region, rays/s."""
-        if self._is_dark:
-            return float("inf")
-        done = self._tracer.rays_done
-        # pixels evenly over the region, as rays cost more where there is more to meet
-        index = self._index[np.linspace(0, self._index.size - 1, min(self._index.size, 8192)).astype(np.int64)]
-        window, seconds = Windows(np.zeros(1), np.full(1, 1000.0)), np.inf
-        for _ in range(2):  # the first pass compiles the kernel
-            start = time.perf_counter()
-            where = np.zeros(index.size, np.int64)
-            self._tracer.trace(index, where, window, np.full(index.size, 64), np.ones(index.size, np.bool_))
-            seconds = time.perf_counter() - start
-        self._tracer.rays_done = done
-        return 64 * index.size / seconds
 
     # ---- for the audit ----------------------------------------------------------------------------
 

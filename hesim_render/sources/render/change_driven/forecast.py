@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.sources.render.change_driven.adaptive import BAND_PIXELS
 from hesim_render.sources.render.change_driven.anchor import anchor_us, period_us
 from hesim_render.sources.render.change_driven.event_blocks import FEW
 from hesim_render.sources.renderer import Demand, Estimate
@@ -42,8 +43,9 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
     The estimate.
     """
     is_static, event_pixel, exposures = source.is_static, demand.event_pixel, demand.exposures
-    rng = np.random.default_rng(source.seed)
-    rays, windows = 0.0, 0
+    rng, look = np.random.default_rng(source.seed), source.foresight
+    # rays of the picture and of pilots, and traces
+    picture, pilots, traces, windows = 0.0, 0.0, 0.0, 0
     if event_pixel.size and demand.blocks.blocks:
         every = demand.blocks.blocks
         windows = max(block.wanted.size for block in every)
@@ -55,40 +57,47 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         begin_us, end_us = anchor_us(every[0].begin_us, every[0].end_us, source.has_ticks)
         anchor = np.array([begin_us]), np.array([end_us])
         # what never changes is rendered in the first anchor alone
-        alive = source.may_change(patch, *anchor)
+        alive = look.may_change(patch, *anchor)
         moving, alive_part = patch[alive], float(np.mean(alive))
-        counts = [
-            source.foretell(moving, block.begin_us, block.end_us, "events", end)
+        blocks = [
+            look.block(moving, block.begin_us, block.end_us, "events", end)
             for block, end in zip(chosen, ends, strict=True)
         ]
-        each, compared, anchors, pilots = np.mean(counts, axis=0)
+        each, compared, anchors, looks = np.mean([block.rays for block in blocks], axis=0)
         # all pixels are rendered in the first anchor, and in later ones those that are compared with it
-        own, _, _, pilot = source.foretell(patch, *anchor, "events", is_anchor=True)
-        first = own + pilot
+        first = look.block(patch, *anchor, "events", is_anchor=True)
         # the first window of the first block belongs to no block before it, and may be the anchor itself
         begin = 0.0
         if (begin_us, end_us) != (every[0].begin_us[0], every[0].end_us[0]):
-            begin = source.foretell(moving, every[0].begin_us[:1], every[0].end_us[:1], "events")[0]
+            begin = float(look.block(moving, every[0].begin_us[:1], every[0].end_us[:1], "events").rays[0])
         # where nearly all may change, the pilot of the first anchor goes on
-        begin -= pilot if 1 - alive_part <= FEW else 0.0
+        saved = float(first.rays[3]) if 1 - alive_part <= FEW else 0.0
         share = np.mean([np.ptp(block.end_us) / period_us(block.end_us, source.has_ticks) for block in chosen])
         more_anchors = max(0.0, float(np.ceil(demand.blocks.count * share)) - 1)
-        rest = anchors * more_anchors + compared * (1 + more_anchors) + (each + pilots) * demand.blocks.count
-        rays += float(first + alive_part * (begin + rest)) * event_pixel.size
+        rest = begin + each * demand.blocks.count + anchors * more_anchors + compared * (1 + more_anchors)
+        picture += float(first.rays[0] + alive_part * rest) * event_pixel.size
+        pilots += float(first.rays[3] + alive_part * (looks * demand.blocks.count - saved)) * event_pixel.size
+        bands = np.ceil(alive_part * event_pixel.size / BAND_PIXELS)
+        traces += float(bands * np.mean([block.traces for block in blocks]) * demand.blocks.count)
     # frames; of a static scene each pixel once, those of events included
     pixel = demand.pixels if is_static else np.unique(demand.frame_pixel if exposures else demand.frame_pixel[:0])
     if pixel.size:
         patch = _sample(pixel, source, "any", rng)
         begin, end = (0.0, 1000.0) if not exposures else (float(exposures[0].start_us), float(exposures[0].t_us))
-        each_frame = source.foretell(patch, np.array([begin]), np.array([end]), "any").sum()
-        rays += each_frame * pixel.size * (1 if is_static else len(exposures))
+        frame, times = look.block(patch, np.array([begin]), np.array([end]), "any"), 1 if is_static else len(exposures)
+        picture += float(frame.rays[:3].sum()) * pixel.size * times
+        pilots += float(frame.rays[3]) * pixel.size * times
+        traces += frame.traces * float(np.ceil(pixel.size / BAND_PIXELS)) * times
+    speed, rays = look.speed(), picture + pilots
     held = _WINDOW_BYTES * windows * event_pixel.size
     return Estimate(
-        seconds=rays * (1 / max(source.rays_per_second(), 1.0) + _BESIDE_S),
+        seconds=picture * speed.picture_ray_s + pilots * speed.pilot_ray_s + rays * _BESIDE_S + traces * speed.start_s,
         peak_bytes=_BASE_BYTES + held + _EVENT_BYTES * event_pixel.size + _FRAME_BYTES * demand.frame_pixel.size,
         rays=rays,
         held_bytes=held,
         audit_rays=_PATH_AUDIT_RAYS if source.sees_paths and not source.has_ticks else float("inf"),
+        ray_s=speed.picture_ray_s + _BESIDE_S,
+        trace_s=speed.start_s,
     )
 
 

@@ -98,11 +98,17 @@ class PacketTracer(Tracer):
     light : waveform of all lights of the scene, None if they are steady. The flux in a window is then the mean over
         instants whose density is the waveform.
 
+    Attributes
+    ----------
+    traces : number of traces started so far.
+
     Raises
     ------
     SpecError
         If the scene cannot be loaded, does not cover a response, or needs the exact mode.
     """
+
+    traces = 0
 
     def __init__(
         self,
@@ -193,6 +199,7 @@ class PacketTracer(Tracer):
         -------
         Of each ray.
         """
+        self.traces += 1
         rays, pair = self._started(lanes, packets, half_rays, moments, key, footprint, aims)
         types, now = jit(), rays.now
         occluders = () if shadows is None else (spread_out(types.UInt32, shadows, pair),)
