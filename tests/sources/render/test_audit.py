@@ -301,10 +301,36 @@ def test_an_audit_gives_up_where_its_rays_would_not_do(monkeypatch):
     times_left = []
     monkeypatch.setattr(audit_module, "is_hopeless", lambda shares, times: times_left.append(times))
     whole = audited(truth, truth, 1, rays_each=40)
-    assert whole["verdict"] == "not shown" and 1 < whole["rays"] / 300_000 < 1.1
+    assert whole["verdict"] == "not shown" and 0.97 < whole["rays"] / 300_000 < 1.03
     assert whole["events"]["missed_at_most"] > whole["events"]["missed_wanted_at_most"]
     # what is left over what was spent, from an eighth of all on
     assert 3 < times_left[0] < 8 and min(times_left) >= 1 and times_left == sorted(times_left, reverse=True)
+
+
+@pytest.mark.parametrize("least", [64, 300, 1100])
+def test_an_audit_keeps_to_its_rays_however_large_its_batches_are(monkeypatch, least):
+    """Of the last batch it takes the units that come first in the random order, as many as there are rays for."""
+    monkeypatch.setattr(audit_module, "_PART", 0.0)
+    monkeypatch.setattr(audit_module, "_RAYS", 300_000)
+    monkeypatch.setattr(audit_module, "_LEAST_BATCH", least)
+    monkeypatch.setattr(audit_module, "is_hopeless", lambda shares, times: False)
+    ends, look_at = [], Audit._look_at
+
+    def noted(self, batch, tally, which):
+        look_at(self, batch, tally, which)
+        places = np.sort(np.concatenate([place for place, _ in batch]))
+        begin = tally.eventful if which == "eventful" else tally.looked_at
+        np.testing.assert_array_equal(places, np.arange(begin - places.size, begin))
+        assert all(place.size == units.pixel.size for place, units in batch)
+        ends.append((which, begin))
+
+    monkeypatch.setattr(Audit, "_look_at", noted)
+    truth = np.full((TICKS, ROWS * COLS), 1e5)
+    truth[::2, :9] *= 1.5
+    report = audited(truth, truth, 1, rays_each=40)
+    assert 0.97 < report["rays"] / 300_000 < 1.03
+    sizes = np.diff([0, *(end for which, end in ends if which == "calm")])
+    assert sizes[-1] < 2 * sizes[-2] and sizes[0] == least
 
 
 def test_each_batch_is_looked_at_once_for_its_events_and_in_the_same_order_for_the_rest(monkeypatch):

@@ -21,7 +21,7 @@ from hesim_render.sources.protocol import AuditableFlux
 from hesim_render.sources.render.audit.compare import Counted, Tally, compare_crossings, compare_ticks
 from hesim_render.sources.render.audit.confidence import is_hopeless, lower_bound, ratio_upper_bound, upper_bound
 from hesim_render.sources.render.audit.deviations import of_changes, of_frames, summary
-from hesim_render.sources.render.audit.units import Batch, NotedFlux, Units, in_random_order
+from hesim_render.sources.render.audit.units import Batch, NotedFlux, Units, first_units, in_random_order
 from hesim_render.sources.render.change_driven.tuning import FINEST_QUALITY
 
 #: Confidence of each stated bound.
@@ -113,15 +113,20 @@ class Audit:
                 is_clear = at_most <= MOST_EXTRA / 2 or most_left > MOST_EXTRA
                 if spent > room / 2 or (is_clear and spent > _TRIED * room):
                     break
-        start = self._source.rays_traced
+        left = room - ((start := self._source.rays_traced) - begin)
         for number, batch in enumerate(chain(seen, batches)):
+            # a batch is twice as large as the one before it, so the rest of the rays may suffice for a part of it only
+            own, all_units = self._source.rays_traced - start, sum(place.size for place, _ in batch)
+            if own:
+                batch = first_units(batch, tally.looked_at * left / own)
             if events and number >= len(seen):
                 self._look_at(batch, tally, "eventful")
             self._look_at(batch, tally, "calm" if events else "frames")
             result = self._bounds(tally, events)
-            shares, own, left = _shares(result), self._source.rays_traced - start, room - (start - begin)
+            shares, own = _shares(result), self._source.rays_traced - start
             enough = all(bound <= most for _, bound, most in shares)
-            if enough or own > left or (own > _TRIED * room and is_hopeless(shares, left / own)):
+            is_cut = sum(place.size for place, _ in batch) < all_units
+            if enough or is_cut or own > left or (own > _TRIED * room and is_hopeless(shares, left / own)):
                 break
         return result
 

@@ -103,6 +103,11 @@ def in_random_order(noted: Sequence[Units], rng: np.random.Generator, least: int
         first, size = first + chosen.size, min(2 * size, most)
 
 
+def first_units(batch: Batch, end: float) -> Batch:
+    """The units of a batch that come before a place in the random order."""
+    return [(place[place < end], units.at(np.flatnonzero(place < end))) for place, units in batch]
+
+
 @dataclass
 class _Open:
     """Units that are still being noted: places in the list, windows left until they are full, and values so far.
