@@ -10,7 +10,7 @@ from hesim_render.sources.renderer import Demand, Estimate
 # Processor time of one thread of an AVX-512 server (`time.process_time`), of runs of `rotating-star`, `fan` and
 # `colorchecker` on `eiger`, `davis346` and `imx636` at 64x48 px, and of event stages of 3,000 to 49,000 pixels.
 #: Start of a run after its estimate, kernels that are on the disk included, s.
-_START_S = 1.0
+_START_S = 0.5
 #: A window of the event pixels: planning and bookkeeping of the renderer, s.
 _WINDOW_S = 5e-3
 #: A step of the event stage, and a step of asynchronous pixels behind a photoreceptor: s, and s for each event pixel.
@@ -19,9 +19,11 @@ _BENT_STEP_S, _BENT_STEP_PIXEL_S = 2.5e-3, 0.035e-6
 #: A frame, and a pixel of a frame, through noise and into its file, s.
 _FRAME_S, _FRAME_PIXEL_S = 2e-2, 60e-9
 #: Rays of an audit: a multiple of the run's own, and at most so many for pixels with a tick and for asynchronous ones,
-#: whose units have ten windows, or this part of the run's own; its traces, and its start, s.
-_AUDIT_RAYS, _MOST_TICK_RAYS, _MOST_ASYNCHRONOUS_RAYS, _AUDIT_PART = 8.0, 8e6, 24e6, 0.0625
-_AUDIT_TRACES, _AUDIT_S = 100, 0.5
+#: whose units have ten windows, or this part of the run's own; its start, s.
+_AUDIT_RAYS, _MOST_TICK_RAYS, _MOST_ASYNCHRONOUS_RAYS, _AUDIT_PART, _AUDIT_S = 8.0, 8e6, 24e6, 0.0625, 0.5
+#: Traces of such an audit, for pixels with a tick and for asynchronous ones: those of `camera-sweep`, `rotating-star`,
+#: `pendulum` and `robot-arm` on `davis346`, `gen2` and `reference-mono`, 5 to 20 ms.
+_TICK_TRACES, _ASYNCHRONOUS_TRACES = 400.0, 115.0
 
 
 def with_overheads(rays: Estimate, sensor: Sensor, demand: Demand, *, audited: bool, rests: bool) -> Estimate:
@@ -46,10 +48,13 @@ def with_overheads(rays: Estimate, sensor: Sensor, demand: Demand, *, audited: b
         seconds += _WINDOW_S * windows
     if audited and rays.seconds > 0:
         evs = sensor.spec.evs
-        most = _MOST_TICK_RAYS if evs is None or evs.reference == "previous_sample" else _MOST_ASYNCHRONOUS_RAYS
+        has_tick = evs is None or evs.reference == "previous_sample"
+        most, traces = (_MOST_TICK_RAYS, _TICK_TRACES) if has_tick else (_MOST_ASYNCHRONOUS_RAYS, _ASYNCHRONOUS_TRACES)
+        # what takes fewer rays takes fewer traces
+        traces *= min(1.0, rays.audit_rays / most)
         most = min(most, rays.audit_rays)
         again = min(rays.rays if rests else _AUDIT_RAYS * rays.rays, max(most, _AUDIT_PART * rays.rays))
-        seconds += _AUDIT_S + again * rays.ray_s + _AUDIT_TRACES * rays.trace_s
+        seconds += _AUDIT_S + again * rays.ray_s + (0.0 if rests else traces * rays.trace_s)
     return replace(rays, seconds=seconds)
 
 

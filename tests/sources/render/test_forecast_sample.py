@@ -43,8 +43,10 @@ def test_pixels_that_lie_apart_are_taken_one_by_one(monkeypatch):
 def test_only_asynchronous_pixels_that_see_paths_have_short_audits(sensor, is_short):
     scene = hr.load_scene(Path(__file__).parents[3] / "benchmarks/scenes/floor-ball.yaml")
     sensor = hr.load_sensor(sensor).crop(8, 6, 30, 20)
-    demand = Demand(1000, np.empty(0, np.uint32), BlockSample([], 1.0), np.empty(0, np.uint32), [])
-    expected = forecast._PATH_AUDIT_RAYS if is_short else np.inf
-    assert ChangeDrivenFlux(scene, sensor).estimate(demand).audit_rays == expected
+    nothing = np.empty(0, np.uint32)
+    source = ChangeDrivenFlux(scene, sensor)
+    for duration_us, rays in ((7000, 13e6 * 0.35), (20_000, 13e6), (90_000, 13e6)):
+        demand = Demand(duration_us, nothing, BlockSample([], 1.0), nothing, [])
+        assert source.estimate(demand).audit_rays == (pytest.approx(rays) if is_short else np.inf)
     star = ChangeDrivenFlux(hr.load_scene("rotating-star"), sensor)
     assert star.estimate(demand).audit_rays == np.inf

@@ -26,8 +26,8 @@ _BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 14, 110, 60
 #: `eiger` and `camera-sweep` on `gen2`, 0.02 s each, on two threads of an AVX-512 server.
 _BESIDE_S = 33e-9
 #: Rays of an audit of asynchronous pixels that see paths, which looks at changes: the median of five scenes of light
-#: that bounces (`benchmarks/rows.py`), 0.02 s on `davis346`.
-_PATH_AUDIT_RAYS = 13e6
+#: that bounces (`benchmarks/rows.py`) on `davis346`, and the length of these runs, µs. A shorter one has fewer units.
+_PATH_AUDIT_RAYS, _PATH_AUDIT_US = 13e6, 20_000
 
 
 def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
@@ -89,13 +89,14 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         pilots += float(frame.rays[3]) * pixel.size * times
         traces += frame.traces * float(np.ceil(pixel.size / BAND_PIXELS)) * times
     speed, rays = look.speed(), picture + pilots
+    path_audit = _PATH_AUDIT_RAYS * min(1.0, demand.duration_us / _PATH_AUDIT_US)
     held = _WINDOW_BYTES * windows * event_pixel.size
     return Estimate(
         seconds=picture * speed.picture_ray_s + pilots * speed.pilot_ray_s + rays * _BESIDE_S + traces * speed.start_s,
         peak_bytes=_BASE_BYTES + held + _EVENT_BYTES * event_pixel.size + _FRAME_BYTES * demand.frame_pixel.size,
         rays=rays,
         held_bytes=held,
-        audit_rays=_PATH_AUDIT_RAYS if source.sees_paths and not source.has_ticks else float("inf"),
+        audit_rays=path_audit if source.sees_paths and not source.has_ticks else float("inf"),
         ray_s=speed.picture_ray_s + _BESIDE_S,
         trace_s=speed.start_s,
     )
