@@ -218,11 +218,22 @@ def test_a_scene_is_not_still_beyond_half_of_its_rate_or_a_burst():
 
 
 def test_a_rate_changes_beyond_four_errors_of_counting():
-    """Quarters of 5 slices with 20 events each: of a mean over them √(2/20)/√5, so that a difference of 0.566 counts."""
+    """Quarters of 5 slices with 20 events each: of a mean √(2/20)/√5, so that a difference of 0.566 counts."""
     for part, is_told in ((0.56, False), (0.57, True)):
         few = np.full(20, 20.0)
         few[:5], few[-5:] = 20 * (1 - part / 2), 20 * (1 + part / 2)
         assert (stillness.unsteady(slices_tally(few)) is not None) is is_told
+
+
+def test_a_rate_changes_beyond_four_errors_of_its_scatter():
+    """Quarters that differ by 0.6 of the mean, and slices between them that scatter by 0.35 or 0.36 of it.
+
+    Four errors are 4 √((2.5 · 0.6² + 10 y²)/19)/√5 of the mean, 0.598 or 0.608.
+    """
+    for scatter, is_told in ((0.35, True), (0.36, False)):
+        rate = 1 + np.repeat([-0.3, 0, 0.3], [5, 10, 5])
+        rate[5:15] += scatter * (-1) ** np.arange(10)
+        assert (stillness.unsteady(slices_tally(4000 * rate)) is not None) is is_told
 
 
 def test_a_burst_is_beyond_the_count_of_its_chance():
@@ -423,7 +434,7 @@ def test_a_target_tells_each_pixels_ratio_and_so_its_leak():
 def course():
     """Light that turns without rests, and no leak: nothing but its swing."""
     none = np.zeros(target._PIXELS)
-    return target._Course(none, none, (0.0, 0.0), 0.0, np.zeros((2, 2)))
+    return target._Course(none, none, (0.0, 0.0), 0.0, np.zeros((2, 2)), 0.0)
 
 
 @pytest.mark.parametrize("scatters", [True, False])
@@ -437,7 +448,9 @@ def test_errors_of_a_target_go_from_its_moments_through_their_slope(monkeypatch,
         period_s=lambda: period_s,
     )  # fmt: skip
     ends, leak_hz, asked = np.array([[0.02, 0.05], [0.07, 0.03]]), 1.7, []
-    over = SimpleNamespace(top=np.array([0.2, 0.4]), bottom=np.array([0.1, 0.25]), unsure=0.08, ends=ends)
+    over = SimpleNamespace(
+        top=np.array([0.2, 0.4]), bottom=np.array([0.1, 0.25]), unsure=0.08, ends=ends, alike=-0.4
+    )  # fmt: skip
     fitted = np.array([0.21, 0.33, 0.011 if scatters else 0.0003])
     slope = np.array([[-30.0, 2.0, 0.4], [1.5, -14.0, 0.3], [0.02, 0.01, 0.9]])
     root = rng.normal(size=(3, 3)) * [[0.03], [0.02], [0.0002]]
@@ -475,7 +488,9 @@ def test_errors_of_a_target_go_from_its_moments_through_their_slope(monkeypatch,
     simulated = np.linalg.inv(slope) @ root @ root.T @ np.linalg.inv(slope).T
     unsure = 0.08 * np.array([1, 1 / ratio]) / a_cycle.mean(axis=1)
     errors = np.sqrt(scatter(left) ** 2 + np.diag(simulated) + [*(fitted[:2] * unsure) ** 2, (0.06 * fitted[2]) ** 2])
-    beyond = ends @ fitted[:2] / (rise + 0.3 * fitted[0] + 0.175 * fitted[1])
+    own = ends * fitted[:2]
+    beyond = np.sqrt([one @ [[1, -0.4], [-0.4, 1]] @ one for one in own])
+    beyond = beyond / (rise + 0.3 * fitted[0] + 0.175 * fitted[1])
     for k, name in enumerate(("theta_on", "theta_off")):
         entry, half = found.entries[name], stats.t.ppf(0.975, 19) * errors[k]
         low, high = (np.hypot(half, part * fitted[k]) for part in beyond)

@@ -154,8 +154,9 @@ def likelihoods(
     cutoff_hz: NDArray[np.float64],
     of_ramps: Jitter | None,
     ratio: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Logarithm of the likelihood that all but its own late events give to the values of each rest, [cut-off, noise].
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Logarithm of the likelihood that all but its own late events give to the values of each rest, [cut-off, noise],
+    and that of the ramps alone, [cut-off, noise at the top, at the bottom].
 
     Parameters
     ----------
@@ -172,6 +173,7 @@ def likelihoods(
     return (
         np.asarray(special.logsumexp(own + bottom[:, None, :], axis=2)),
         np.asarray(special.logsumexp(own + top[:, :, None], axis=1)),
+        own,
     )
 
 
