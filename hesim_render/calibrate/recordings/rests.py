@@ -31,8 +31,8 @@ _NOISE, _CUTOFF_HZ = np.geomspace(2e-3, 0.7, 60), np.geomspace(20.0, 2000.0, 33)
 #: 0.6 where any part of it grows with the light, and the still scenes have any light of the target.
 _LEAK, _LEAK_DEVIATION = np.array([0.2, 0.3, 0.4, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0, 4.0, 5.5]), 0.6
 #: Relative error of the law of late events, given the bandwidth: measured on 17 rests of nine sensors written in NumPy,
-#: without a leak and with poles of the noise 1 to 7 apart (6 % rms with equal ones, 2 % with others, 5 % together, errors
-#: of counting taken off); judged on the hundred of the tests, which have seeds of their own.
+#: without a leak and with poles of the noise 1 to 7 apart (6 % rms with equal ones, 2 % with others, 5 % together,
+#: errors of counting taken off); judged on the hundred of the tests, which have seeds of their own.
 _LAW_ERROR = 0.05
 #: Late events in the last half of a rest over those of the quarter before, above which events back are among them.
 #: Chosen on sensors like the six of the tests, judged there on seeds of their own.
