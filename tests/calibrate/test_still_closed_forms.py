@@ -201,8 +201,9 @@ def test_a_scene_is_not_still_beyond_half_of_its_rate_or_a_burst():
     even = np.full(20, 4000.0)
     assert stillness.not_still(slices_tally(even)) is None
     steps = even.copy()
-    steps[:5], steps[-5:] = 4000 * 0.755, 4000 * 1.245  # a difference of 0.49 of the mean
-    assert stillness.not_still(slices_tally(steps)) is None
+    for early, late in ((0.755, 1.245), (0.75, 1.25)):  # differences of 0.49 and of exactly 0.5 of the mean
+        steps[:5], steps[-5:] = 4000 * early, 4000 * late
+        assert stillness.not_still(slices_tally(steps)) is None
     steps[:5], steps[-5:] = 4000 * 0.745, 4000 * 1.255
     told = stillness.not_still(slices_tally(steps))
     # 2980 and 5020 events of 40 pixels in 0.1 s
@@ -214,6 +215,38 @@ def test_a_scene_is_not_still_beyond_half_of_its_rate_or_a_burst():
         high = next(c for c in range(400, 4000, 4) if c > stats.poisson.isf(1e-3 / 20, 3 * (19 * 400 + c) / 20))
         burst[9] = 4 * round(factor * high / 4)
         assert (stillness.not_still(slices_tally(burst)) is not None) is is_told
+
+
+def test_a_rate_changes_beyond_four_errors_of_counting():
+    """Quarters of 5 slices with 20 events each: of a mean √(2/20)/√5, so that a difference of 0.566 counts."""
+    for part, is_told in ((0.56, False), (0.57, True)):
+        few = np.full(20, 20.0)
+        few[:5], few[-5:] = 20 * (1 - part / 2), 20 * (1 + part / 2)
+        assert (stillness.unsteady(slices_tally(few)) is not None) is is_told
+
+
+def test_a_rate_changes_beyond_four_errors_of_its_scatter():
+    """Quarters that differ by 0.6 of the mean, and slices between them that scatter by 0.35 or 0.36 of it.
+
+    Four errors are 4 √((2.5 · 0.6² + 10 y²)/19)/√5 of the mean, 0.598 or 0.608.
+    """
+    for scatter, is_told in ((0.35, True), (0.36, False)):
+        rate = 1 + np.repeat([-0.3, 0, 0.3], [5, 10, 5])
+        rate[5:15] += scatter * (-1) ** np.arange(10)
+        assert (stillness.unsteady(slices_tally(4000 * rate)) is not None) is is_told
+
+
+def test_a_burst_is_beyond_the_count_of_its_chance():
+    """A slice with as many events as three times the mean has with a chance of 1e-3/20 is none, with one more it is."""
+    for each in range(400, 500):
+        most = [c for c in range(1200, 2000) if c == stats.poisson.isf(1e-3 / 20, 3 * (19 * each + c) / 20)]
+        for count in most[-1:]:
+            for more, is_told in ((0, False), (4, True)):
+                burst = np.full(20, float(each))
+                burst[9] = count + more
+                assert (stillness.unsteady(slices_tally(burst)) is not None) is is_told
+            return
+    raise AssertionError("no count is at its limit")
 
 
 @pytest.mark.parametrize(("turns", "period", "lamp", "is_seen"), [
@@ -275,6 +308,19 @@ def test_on_events_of_one_phase_are_those_of_a_lamp():
         one.waves[1] = np.sqrt(depth**2 * each**2 + each) * np.exp(1j * np.arange(SLICES))
         assert (stillness.not_still(one) is not None) is is_seen, (depth, each)
     assert "a lamp of 120 Hz (the sum of their phases is 20 % of" in stillness.of_a_lamp(one)
+
+
+def test_slices_that_are_no_whole_number_of_periods_have_a_sum_of_their_own():
+    """Of 22.5 ms each: the sum of even events is left out, so that 0.2 of one phase in each slice are read as such."""
+    one, each = slices_tally(np.full(20, 4000 / 0.75)), 4000
+    one.seconds = 0.45
+    at = (np.arange(20_000) + 0.5) * 0.45 / 20_000
+    even = np.array([np.exp(2j * np.pi * hz * at).reshape(SLICES, -1).mean(axis=1) for hz in LAMPS_HZ])
+    assert np.abs(even).max() > 0.1
+    one.waves = each * even
+    assert stillness.of_a_lamp(one) is None
+    one.waves[0] += np.sqrt(0.2**2 * each**2 + each) * np.exp(1j * np.arange(SLICES))
+    assert "a lamp of 100 Hz (the sum of their phases is 20 % of" in stillness.of_a_lamp(one)
 
 
 def rates_of(rng, lux, ratio, dark, growth, scatter=0.0):
@@ -388,7 +434,7 @@ def test_a_target_tells_each_pixels_ratio_and_so_its_leak():
 def course():
     """Light that turns without rests, and no leak: nothing but its swing."""
     none = np.zeros(target._PIXELS)
-    return target._Course(none, none, (0.0, 0.0), 0.0, np.zeros((2, 2)))
+    return target._Course(none, none, (0.0, 0.0), 0.0, np.zeros((2, 2)), 0.0)
 
 
 @pytest.mark.parametrize("scatters", [True, False])
@@ -402,7 +448,9 @@ def test_errors_of_a_target_go_from_its_moments_through_their_slope(monkeypatch,
         period_s=lambda: period_s,
     )  # fmt: skip
     ends, leak_hz, asked = np.array([[0.02, 0.05], [0.07, 0.03]]), 1.7, []
-    over = SimpleNamespace(top=np.array([0.2, 0.4]), bottom=np.array([0.1, 0.25]), unsure=0.08, ends=ends)
+    over = SimpleNamespace(
+        top=np.array([0.2, 0.4]), bottom=np.array([0.1, 0.25]), unsure=0.08, ends=ends, alike=-0.4
+    )  # fmt: skip
     fitted = np.array([0.21, 0.33, 0.011 if scatters else 0.0003])
     slope = np.array([[-30.0, 2.0, 0.4], [1.5, -14.0, 0.3], [0.02, 0.01, 0.9]])
     root = rng.normal(size=(3, 3)) * [[0.03], [0.02], [0.0002]]
@@ -440,7 +488,9 @@ def test_errors_of_a_target_go_from_its_moments_through_their_slope(monkeypatch,
     simulated = np.linalg.inv(slope) @ root @ root.T @ np.linalg.inv(slope).T
     unsure = 0.08 * np.array([1, 1 / ratio]) / a_cycle.mean(axis=1)
     errors = np.sqrt(scatter(left) ** 2 + np.diag(simulated) + [*(fitted[:2] * unsure) ** 2, (0.06 * fitted[2]) ** 2])
-    beyond = ends @ fitted[:2] / (rise + 0.3 * fitted[0] + 0.175 * fitted[1])
+    own = ends * fitted[:2]
+    beyond = np.sqrt([one @ [[1, -0.4], [-0.4, 1]] @ one for one in own])
+    beyond = beyond / (rise + 0.3 * fitted[0] + 0.175 * fitted[1])
     for k, name in enumerate(("theta_on", "theta_off")):
         entry, half = found.entries[name], stats.t.ppf(0.975, 19) * errors[k]
         low, high = (np.hypot(half, part * fitted[k]) for part in beyond)

@@ -12,7 +12,7 @@ from hesim_render.calibrate.recordings import ramps, rests, target
 from hesim_render.calibrate.recordings.tally import GROUPS, tally
 from hesim_render.exchange import EventStream
 from hesim_render.pixels.evs.events import EVENT_DTYPE
-from tests.calibrate.test_target_rests import judged, recordings
+from tests.calibrate.test_target_rests import Sensor, judged, recordings
 
 POLE = 2 * np.pi / np.sqrt(np.sqrt(2) - 1)
 
@@ -139,6 +139,7 @@ def test_each_rest_has_the_chance_of_the_other_and_of_the_ramps(monkeypatch):
     monkeypatch.setattr(ramps, "_of_ramps", lambda *_: own)
     for given in (own, np.zeros_like(own)):
         told = ramps.likelihoods(top, bottom, noise, cut, "of ramps" if given is own else None, 1.2)
+        assert np.array_equal(told[2], given)
         for b in range(4):
             for k in range(3):
                 assert told[0][b, k] == pytest.approx(logsumexp(given[b, k] + bottom[b]))
@@ -177,7 +178,7 @@ def test_events_of_some_pixels_are_kept_by_pixel_and_time(monkeypatch):
 
 def test_ramps_tell_the_bandwidth_that_late_events_do_not(monkeypatch):
     """Noise of 60 Hz: thresholds to 1 %, and an interval of less than two thirds of that without the ramps."""
-    of = (0.18, 1.1, 0.07, (1 / 18, 1 / 18), 60.0, 0.1, 2.4, 2.0, (0.4, 0.36))
+    of = Sensor(0.18, 1.1, 0.07, (1 / 18, 1 / 18), 60.0, 0.1, 2.4, 2.0, (0.4, 0.36))
     one = recordings(of, 11, 1)
     outcome = judged(of, one)[0]
     assert outcome[:2, 0].all() and np.abs(outcome[:2, 1]).max() < 0.01, outcome
@@ -219,7 +220,7 @@ def test_rests_that_are_short_beside_the_intervals_of_a_ramp_have_their_noise_fr
     """Six events a ramp and rests of as long as eight of them: no late event is one for sure. Without a correction
     thresholds are 3 % too low, many of their errors.
     """
-    of = (0.29, 1.13, 0.1, (1 / 24, 1 / 27), 480.0, 0.0, 1.86, 4.2, (0.25, 0.29))
+    of = Sensor(0.29, 1.13, 0.1, (1 / 24, 1 / 27), 480.0, 0.0, 1.86, 4.2, (0.25, 0.29))
     one = recordings(of, 1031, 1)
     both = rests.rests(one[0], of[5], of[1])
     assert [rest.late.size for rest in both] == [0, 0]

@@ -27,7 +27,7 @@ def made(t_us, pixel, polarity):
 def poisson(seed, rate=1.0, on=0.6, hot=0, rhythm=0.0, burst=1, pairs=0.0, regular=False):
     """Random events; `rhythm` of 40 Hz in the rate, bursts, events of neighbours at once, or equal intervals."""
     rng = np.random.default_rng(seed)
-    count = round(rate * RATE_HZ * PIXELS * SECONDS / burst)
+    count = rng.poisson(rate * RATE_HZ * PIXELS * SECONDS / burst)
     t_us, pixel = rng.uniform(0, SECONDS * 1e6, count), rng.integers(0, PIXELS, count)
     if regular:
         number = round(RATE_HZ * SECONDS)
@@ -38,8 +38,8 @@ def poisson(seed, rate=1.0, on=0.6, hot=0, rhythm=0.0, burst=1, pairs=0.0, regul
     keep = rng.random(t_us.size) < (1 + rhythm * np.sin(2 * np.pi * 40 * t_us * 1e-6)) / (1 + rhythm)
     t_us, pixel = t_us[keep], pixel[keep]
     if hot:
-        extra = round(40 * RATE_HZ * SECONDS)
-        t_us = np.append(t_us, rng.uniform(0, SECONDS * 1e6, hot * extra))
+        extra = rng.poisson(40 * RATE_HZ * SECONDS, hot)
+        t_us = np.append(t_us, rng.uniform(0, SECONDS * 1e6, extra.sum()))
         pixel = np.append(pixel, np.repeat(np.arange(hot) * 29, extra))
     if burst > 1:
         t_us = (t_us[:, None] + 400 * np.arange(burst)).ravel()

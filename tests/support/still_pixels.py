@@ -5,6 +5,7 @@ equal poles, a drift of the reference, light whose logarithm rises and falls in 
 """
 
 import numpy as np
+from scipy.linalg import expm
 
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
@@ -105,23 +106,33 @@ def target_events(rng, theta_on, theta_off, rise, *, hz, cycles, shape, sigma=0.
     return _events(found, shape[1])
 
 
+def two_poles(cutoff_hz, apart):
+    """Two poles, the second so many times the first, together −3 dB at a corner: their geometric mean and sum, 1/s."""
+    both = 1 + apart**-2
+    first = 2 * np.pi * cutoff_hz * np.sqrt(0.5 * both + np.sqrt(0.25 * both**2 + apart**-2))
+    return first * np.sqrt(apart), first * (1 + apart)
+
+
 def noisy_target_events(
-    rng, theta_on, theta_off, rise, *, hz, rests, cycles, shape, sigma, cutoff_hz, drift=0.0, light=None
+    rng, theta_on, theta_off, rise, *, hz, rests, cycles, shape, sigma, cutoff_hz, drift=0.0, light=None, apart=1.0
 ):
     """Events of pixels that see bars pass by: the logarithm of the light rises, rests, falls and rests.
 
     Parameters
     ----------
     rests : parts of a cycle for which the light rests at its top and at its bottom; it rises and falls equally long.
-    sigma : of the noise in the dark and in the bright light; it has two equal poles of corner `cutoff_hz`.
+    sigma : of the noise in the dark and in the bright light; it has two poles of corner `cutoff_hz`.
+    drift : of the reference in ln units a second; a pair grows with the light from that of the dark to the bright one.
     light : part of the rise [pixel] at a place of the cycle, in place of that of `rests` at random phases.
+    apart : the second pole of the noise over the first.
     """
-    pole = 2 * np.pi * cutoff_hz / np.sqrt(np.sqrt(2) - 1)
-    steps, size = max(round(16 * cutoff_hz / hz), 200), theta_on.size
+    mean, both = two_poles(cutoff_hz, apart)
+    steps, size = max(round(16 * mean * np.sqrt(np.sqrt(2) - 1) / (2 * np.pi * hz)), 200), theta_on.size
     dt = 1 / (hz * steps)
-    h = pole * dt
-    move = np.exp(-h) * np.array([[1 + h, h], [-h, 1 - h]])
+    # level and velocity over `mean`, each of variance 1
+    move = expm(np.array([[0, mean], [-mean, -both]]) * dt)
     fresh = np.linalg.cholesky(np.eye(2) - move @ move.T)
+    in_dark, in_bright = np.broadcast_to(drift, 2)
     ramp = (1 - sum(rests)) / 2
     turns = np.cumsum([0.0, ramp, rests[0], ramp, rests[1]])
     phase, state = rng.random(size), rng.standard_normal((2, size))
@@ -133,7 +144,7 @@ def noisy_target_events(
         place = (k / steps + phase) % 1 if light is None else k / steps
         part = np.interp(place, turns, [0.0, 1.0, 1.0, 0.0, 0.0]) if light is None else light(place)
         level = rise * part + (sigma[0] + (sigma[1] - sigma[0]) * part) * state[0]
-        reference = reference - drift * dt
+        reference = reference - (in_dark + (in_bright - in_dark) * np.expm1(rise * part) / np.expm1(rise)) * dt
         for sign, theta in ((1, theta_on), (-1, theta_off)):
             count = np.maximum(np.floor(sign * (level - reference) / theta), 0).astype(int)
             some = np.flatnonzero(count)

@@ -41,6 +41,8 @@ _LEFT = np.array([1.0, 0.89, 0.81, 0.735, 0.67, 0.555, 0.5, 0.46, 0.39, 0.35])
 _MOST_NOISE = 0.25
 #: Largest V that tells: events of strong noise leave intervals that count no longer, those with the largest D.
 _MOST_VARIANCE = 0.2
+#: On 18 sensors written in NumPy (33 to 1512 Hz, poles 1 to 7 apart) ln V is off by 0.15 rms, −0.11 in the mean; on
+#: one of 27 Hz and the smallest noise by −0.65.
 #: Error of ln V, one for all intervals of both polarities, and what unlike noise in bright and dark light adds to it,
 #: over the logarithm of their variances' ratio.
 _LAW_ERROR, _OF_LIGHT = 0.15, 0.25
@@ -154,8 +156,9 @@ def likelihoods(
     cutoff_hz: NDArray[np.float64],
     of_ramps: Jitter | None,
     ratio: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Logarithm of the likelihood that all but its own late events give to the values of each rest, [cut-off, noise].
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Logarithm of the likelihood that all but its own late events give to the values of each rest, [cut-off, noise],
+    and that of the ramps alone, [cut-off, noise at the top, at the bottom].
 
     Parameters
     ----------
@@ -172,6 +175,7 @@ def likelihoods(
     return (
         np.asarray(special.logsumexp(own + bottom[:, None, :], axis=2)),
         np.asarray(special.logsumexp(own + top[:, :, None], axis=1)),
+        own,
     )
 
 

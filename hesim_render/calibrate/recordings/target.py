@@ -98,7 +98,8 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     of_simulated = inverse @ of_simulated @ inverse.T
     # the swing of the level is that of the light and both overshoots, of which one bandwidth is not known
     swing = rise + course.top.mean() * fitted[0] + course.bottom.mean() * fitted[1]
-    over = course.ends @ fitted[:2] / swing
+    one, other = (course.ends * fitted[:2]).T
+    over = np.sqrt(one**2 + other**2 + 2 * course.alike * one * other) / swing
     left_out = 1 - np.count_nonzero(seen) / np.count_nonzero(tally.used & (tally.per_pixel().min(axis=0) > 0))
     partial = _PARTIAL if course.ends.any() else _PARTIAL * min(left_out / _LEFT_OUT, 1.0)
     beside = fitted * np.append(unsure, partial)
@@ -144,6 +145,7 @@ class _Course(NamedTuple):
     drifts : of the reference from the begin of the top to that of the bottom, and on to the next top, in θ₊.
     unsure : what is not known of the drift, in θ₊ a cycle.
     ends : how far the interval of the mean of each overshoot goes down and up from it, [2, top and bottom].
+    alike : correlation of what is not known of both overshoots.
     """
 
     top: NDArray[np.float64]
@@ -151,6 +153,7 @@ class _Course(NamedTuple):
     drifts: tuple[float, float]
     unsure: float
     ends: NDArray[np.float64]
+    alike: float
 
 
 def _course(tally: EventTally, leak_hz: float, period_s: float, ratio: float) -> _Course:
@@ -159,15 +162,16 @@ def _course(tally: EventTally, leak_hz: float, period_s: float, ratio: float) ->
     of_ramps = None if both is None else jitter(tally)
     if both is None or (of_ramps is None and not all(rest.late.size for rest in both)):
         none, half = np.zeros(_PIXELS), 0.5 * leak_hz * period_s
-        return _Course(none, none, (half, half), UNSURE_LEAK * half, np.zeros((2, 2)))
-    top, bottom = overshoots(*both, _PIXELS, of_ramps, ratio)
+        return _Course(none, none, (half, half), UNSURE_LEAK * half, np.zeros((2, 2)), 0.0)
+    top, bottom, alike = overshoots(*both, _PIXELS, of_ramps, ratio)
     ramp_s = 0.5 * max(period_s - both[0].ramps.rest_s - both[1].ramps.rest_s, 0.0)
     leaks = top.drift, -bottom.drift * ratio
     ramp_leak_hz = 0.5 * (leaks[0] + leaks[1])
     drifts = [own * rest.ramps.rest_s + ramp_leak_hz * ramp_s for own, rest in zip(leaks, both, strict=True)]
-    unsure = 0.5 * (top.drift_error * both[0].ramps.rest_s + bottom.drift_error * ratio * both[1].ramps.rest_s)
+    lasting = [rest.ramps.rest_s + ramp_s for rest in both]  # of each leak: half of either ramp has it
+    unsure = 0.5 * (top.drift_error * lasting[0] + bottom.drift_error * ratio * lasting[1])
     ends = np.array([[one.mean - one.low, one.high - one.mean] for one in (top, bottom)]).T
-    return _Course(top.quantiles, bottom.quantiles, (drifts[0], drifts[1]), unsure, ends)
+    return _Course(top.quantiles, bottom.quantiles, (drifts[0], drifts[1]), unsure, ends, alike)
 
 
 def of_whole_cycles(stream: EventStream, first: EventTally, cycles_hz: float | None) -> EventTally:
