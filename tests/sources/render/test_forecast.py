@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render.mosaic.schedule import BlockSample, tick_blocks
+from hesim_render.mosaic.schedule import BlockSample, Exposure, tick_blocks
 from hesim_render.sources.render.change_driven import forecast
 from hesim_render.sources.render.change_driven.anchor import anchor_us
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
@@ -141,3 +141,17 @@ def test_the_speed_is_that_of_the_pairs_with_most_rays():
     assert times == pytest.approx(8192 * pairs[3][most] / pairs[3].sum(), abs=1)
     # without any pairs, all rays are those of the whole region
     assert ahead.speed().picture_ray_s == pytest.approx(ahead.speed().pilot_ray_s, rel=3)
+
+
+def test_rays_of_frames_have_less_beside_them():
+    """Of 800 event pixels and 300 frame pixels in each of two exposures, with a table of rays for either."""
+    spec, pixels = hr.load_sensor("gen2").spec.evs, np.arange(800, dtype=np.uint32)
+    blocks = list(tick_blocks(spec, 0, 20_000))
+    events = Demand(20_000, pixels, BlockSample(blocks, 1.0), np.empty(0, np.uint32), [])
+    exposures = [Exposure(k, 10_000 * k, 9000, 48, 0.0) for k in range(2)]
+    both = replace(events, frame_pixel=np.arange(300, dtype=np.uint32), exposures=exposures)
+    alone, with_frames = (forecast.forecast(Counted(0.3), demand) for demand in (events, both))
+    # 95 rays of the picture and 30 of pilots, and seven traces in each exposure
+    assert with_frames.rays - alone.rays == pytest.approx(300 * 2 * 125)
+    seconds = 300 * 2 * (95 * 3e-6 + 30 * 2e-6 + 125 * 15e-9) + 2 * 7 * 0.04
+    assert with_frames.seconds - alone.seconds == pytest.approx(seconds)

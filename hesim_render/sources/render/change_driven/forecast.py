@@ -22,9 +22,10 @@ _SINGLE = 4096
 #: Memory of the program with its kernels, per event pixel and window of a block, and per event pixel and frame pixel
 #: of the stages, bytes.
 _BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 14, 110, 60
-#: Time of plans, statistics and copies for each ray, beside that of tracing it, s: of `rotating-star` on `davis346` and
-#: `eiger` and `camera-sweep` on `gen2`, 0.02 s each, on two threads of an AVX-512 server.
-_BESIDE_S = 33e-9
+#: Time of plans, statistics and copies for each ray, beside that of tracing it, s: of event pixels (`rotating-star` on
+#: `davis346` and `eiger`, `camera-sweep` on `gen2`, 0.02 s each), and of frames (`camera-sweep` and `pendulum` on
+#: `reference-bayer`, 0.04 s each), on two threads of AVX-512 servers.
+_BESIDE_S, _FRAME_BESIDE_S = 33e-9, 15e-9
 #: Rays of an audit of asynchronous pixels that see paths, which looks at changes: the median of five scenes of light
 #: that bounces (`benchmarks/rows.py`) on `davis346`, and the length of these runs, µs. A shorter one has fewer units.
 _PATH_AUDIT_RAYS, _PATH_AUDIT_US = 13e6, 20_000
@@ -45,7 +46,7 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
     is_static, event_pixel, exposures = source.is_static, demand.event_pixel, demand.exposures
     rng, look = np.random.default_rng(source.seed), source.foresight
     # rays of the picture and of pilots, and traces
-    picture, pilots, traces, windows = 0.0, 0.0, 0.0, 0
+    picture, pilots, traces, windows, beside_s = 0.0, 0.0, 0.0, 0, 0.0
     if event_pixel.size and demand.blocks.blocks:
         every = demand.blocks.blocks
         windows = max(block.wanted.size for block in every)
@@ -79,6 +80,7 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         pilots += float(first.rays[3] + alive_part * (looks * demand.blocks.count - saved)) * event_pixel.size
         bands = np.ceil(alive_part * event_pixel.size / BAND_PIXELS)
         traces += float(bands * np.mean([block.traces for block in blocks]) * demand.blocks.count)
+        beside_s = (picture + pilots) * _BESIDE_S
     # frames; of a static scene each pixel once, those of events included
     pixel = demand.pixels if is_static else np.unique(demand.frame_pixel if exposures else demand.frame_pixel[:0])
     if pixel.size:
@@ -86,13 +88,14 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         begin, end = (0.0, 1000.0) if not exposures else (float(exposures[0].start_us), float(exposures[0].t_us))
         frame, times = look.block(patch, np.array([begin]), np.array([end]), "any"), 1 if is_static else len(exposures)
         picture += float(frame.rays[:3].sum()) * pixel.size * times
+        beside_s += float(frame.rays.sum()) * pixel.size * times * _FRAME_BESIDE_S
         pilots += float(frame.rays[3]) * pixel.size * times
         traces += frame.traces * float(np.ceil(pixel.size / BAND_PIXELS)) * times
     speed, rays = look.speed(), picture + pilots
     path_audit = _PATH_AUDIT_RAYS * min(1.0, demand.duration_us / _PATH_AUDIT_US)
     held = _WINDOW_BYTES * windows * event_pixel.size
     return Estimate(
-        seconds=picture * speed.picture_ray_s + pilots * speed.pilot_ray_s + rays * _BESIDE_S + traces * speed.start_s,
+        seconds=picture * speed.picture_ray_s + pilots * speed.pilot_ray_s + beside_s + traces * speed.start_s,
         peak_bytes=_BASE_BYTES + held + _EVENT_BYTES * event_pixel.size + _FRAME_BYTES * demand.frame_pixel.size,
         rays=rays,
         held_bytes=held,
