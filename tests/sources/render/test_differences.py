@@ -336,7 +336,8 @@ def test_a_pilot_says_whether_the_camera_moves():
     assert take_pilot(tracer, *given)[0].all_move
 
 
-def test_what_a_pilot_compares_and_between_which_looks_it_traces():
+@pytest.mark.parametrize(("width_px", "reach"), [(1.09, (2, 1)), (1.15, (2, 0)), (1.25, (0, 0))])
+def test_what_a_pilot_compares_and_between_which_looks_it_traces(width_px, reach):
     """Nine windows and looks at every fourth, 11×11 sites: one changes from window 6 on, one is far from all motion."""
     sites, far = sites_of(), 10 * 11 + 10
     light, near = np.full((9, 121), 250.0, np.float32), np.ones(121, bool)
@@ -347,12 +348,12 @@ def test_what_a_pilot_compares_and_between_which_looks_it_traces():
     anchored = Anchored(anchor, PilotRays(zeros, zeros, 16, (1.0, 2.0)), (-3.0, -2.0))
     numbers = np.repeat(np.arange(9)[:, None], 121, axis=1)
     windows = Windows(np.arange(9.0), np.arange(9.0) + 1)
-    pilot, _ = take_pilot(tracer, sites, windows, numbers, 16, 1.25, None, anchored=anchored, stride=4)
+    pilot, _ = take_pilot(tracer, sites, windows, numbers, 16, width_px, None, anchored=anchored, stride=4)
     np.testing.assert_array_equal(pilot.controlled, light)
     assert not pilot.all_move
     row, col = np.indices((11, 11))
-    # within half of the stride, what comes from one pixel away
-    busy, beside = (np.flatnonzero(((abs(row - 5) <= k) & (abs(col - 5) <= k)).ravel()) for k in (2, 1))
+    # within half of the stride, what comes from one pixel away; what a wide look sees by itself asks for none beside it
+    busy, beside = (np.flatnonzero(((abs(row - 5) <= k) & (abs(col - 5) <= k)).ravel()) for k in reach)
     looks = [(window, site) for window in (0, 4, 8) for site in range(121) if window == 0 or site != far]
     halved = [(6, site) for site in busy] + [(5, site) for site in beside]
     assert sorted(tracer.traced) == sorted([*looks, *halved])
