@@ -85,6 +85,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "calibrate.recordings.rests": ("tests/calibrate/test_target_rests.py", "tests/calibrate/test_target_ramps.py"),
     "calibrate.recordings.stillness": ("tests/calibrate/test_still_closed_forms.py",),
     "measure.event_distance": ("tests/measure/test_event_distance.py",),
+    "measure.event_statistics": ("tests/measure/test_event_distance.py",),
 }
 
 

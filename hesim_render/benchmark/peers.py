@@ -32,7 +32,8 @@ from hesim_render.core.output import check_place, write_whole
 from hesim_render.core.plain import as_plain
 from hesim_render.core.progress import Progress
 from hesim_render.exchange import EventStream
-from hesim_render.measure.event_distance import EventStatistics, event_distances, event_statistics
+from hesim_render.measure.event_distance import event_distances
+from hesim_render.measure.event_statistics import EventStatistics, event_statistics
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.light_level import in_absolute_light

@@ -95,7 +95,8 @@ def compare(
     Rates, intervals, correlations, polarity, hot pixels and bursts, each as a distance with an interval.
     """
     from hesim_render.exchange import open_events
-    from hesim_render.measure.event_distance import PARTS, event_distances, event_statistics, of_equal_time
+    from hesim_render.measure.event_distance import event_distances
+    from hesim_render.measure.event_statistics import PARTS, event_statistics, of_equal_time
 
     shape = None if size is None else parse_size(size)
     console = Console(json_, quiet)

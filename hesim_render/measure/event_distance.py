@@ -1,170 +1,25 @@
 """How far two streams of events of like scenes are from one another, figure by figure, with intervals.
 
 The time of each stream is cut into 20 parts, which are drawn anew with replacement, those of both streams
-independently. A distance of samples is never 0: each figure also has the distance of two such draws of the first
-stream, at most in 95 of 100 cases. A difference below that is none that these recordings show.
+independently: an interval holds what longer streams of the same pixels would show. A distance of samples is never 0:
+each figure also has the distance of two such draws of the first stream, at most in 95 of 100 cases. A difference below
+that is none that these recordings show.
 
-Statistics of a stream of events, each for successive parts of its time, so that they can be drawn anew.
+Hot pixels are few, and another sensor of a kind has others: their shares are those of pixels drawn at random.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import f as f_law
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from hesim_render.core.errors import SpecError
 from hesim_render.core.units import US_PER_S
-from hesim_render.exchange.stream import EventStream
-from hesim_render.pixels.evs.events import no_events
-
-#: Parts of the time.
-PARTS = 20
-#: Bounds of the intervals between events of a pixel, µs: twenty bins a decade.
-INTERVALS_US = 10 ** np.linspace(0.0, 8.0, 161)
-#: Windows of the rate, µs, and lags of its autocorrelation, windows.
-WINDOW_US, LAGS = 1000, (1, 2, 4, 8, 16, 32)
-#: Windows in which pixels count as active, µs, and the neighbours whose activity is compared: rows and columns away.
-ACTIVE_US, NEIGHBOURS = 5000, ((0, 1), (1, 0), (0, 2), (2, 0))
-#: Longest gap within a burst, µs, and longest burst that is distinguished.
-GAP_US, LONGEST = 1000, 64
-_LEAST_EVENTS, _LEAST_PART_US = 100 * PARTS, 2 * WINDOW_US
-
-
-@dataclass(frozen=True, eq=False)
-class EventStatistics:
-    """Sums over the events of each part.
-
-    Parameters
-    ----------
-    source : name of the stream.
-    shape : rows and columns, px.
-    seconds : time of a part.
-    polarity : [part, 2], ON and OFF events.
-    intervals : [part, bin], intervals between events of a pixel, of any polarity.
-    series : [part, window], events of windows of `WINDOW_US`.
-    active : [part, 1 + neighbour], active pixels of windows of `ACTIVE_US`, and those with an active neighbour.
-    windows : windows of `ACTIVE_US` in a part.
-    bursts : [part, length], bursts of so many events of a pixel.
-    pixels : [part, pixel], events.
-    """
-
-    source: str
-    shape: tuple[int, int]
-    seconds: float
-    polarity: NDArray[np.int64]
-    intervals: NDArray[np.int64]
-    series: NDArray[np.int64]
-    active: NDArray[np.int64]
-    windows: int
-    bursts: NDArray[np.int64]
-    pixels: NDArray[np.uint32]
-
-
-def of_equal_time(first: EventStream, second: EventStream) -> tuple[EventStream, EventStream]:
-    """Two streams, each as long as the shorter one, from its begin.
-
-    Of one law, the longer one has longer intervals, other hot pixels and less scatter.
-    """
-    spans = [_long_span_us(stream) for stream in (first, second)]
-    least_us = min(end_us - begin_us for begin_us, end_us in spans)
-    one, other = (
-        replace(stream, interval_us=(begin_us, begin_us + least_us))
-        for stream, (begin_us, _) in zip((first, second), spans, strict=True)
-    )
-    return one, other
-
-
-def _long_span_us(stream: EventStream) -> tuple[int, int]:
-    """Begin and end of a stream; one that is too short is refused by its own name, before the other is cut to it."""
-    begin_us, end_us = stream.span_us()
-    if end_us + 1 - begin_us <= PARTS * (_LEAST_PART_US - 1):
-        problem = f"lasts {end_us - begin_us} µs; expected {_LEAST_PART_US * PARTS} µs at least"
-        raise SpecError(problem, file=stream.source)
-    return begin_us, end_us
-
-
-def event_statistics(stream: EventStream) -> EventStatistics:
-    """Statistics of a stream, which is read twice; one part of its time is held at once.
-
-    Events after its end, where it has one of its own, are left out.
-
-    Raises
-    ------
-    SpecError
-        If it has too few events, or lasts for less than 2 ms a part.
-    """
-    begin_us, end_us = _long_span_us(stream)
-    part_us = -(-(end_us + 1 - begin_us) // PARTS)
-    rows, cols = stream.shape
-    result: list[tuple[NDArray, ...]] = []
-    # blocks of the file are cut at the ends of parts: only what belongs to the next part is held
-    held, last_us = [no_events()], np.full(rows * cols, -1, np.int64)
-    for events in chain(stream, (no_events(),)):
-        held.append(events)
-        done = begin_us + (len(result) + 1) * part_us
-        while len(result) < PARTS and (events.size == 0 or events["t_us"][-1] >= done):
-            every = np.concatenate(held)
-            inside = np.searchsorted(every["t_us"], done)
-            result.append(_part(every[:inside], begin_us + len(result) * part_us, part_us, last_us, rows, cols))
-            held = [every[inside:]]
-            done += part_us
-        if len(result) == PARTS:
-            break
-    columns = [np.stack(values) for values in zip(*result, strict=True)]
-    if columns[0].sum() < _LEAST_EVENTS:
-        problem = f"has {columns[0].sum()} events in {(end_us - begin_us) / US_PER_S:.4g} s"
-        raise SpecError(f"{problem}; expected {_LEAST_EVENTS} at least", file=stream.source)
-    polarity, intervals, series, active, bursts, pixels = columns
-    return EventStatistics(
-        str(stream.source), (rows, cols), part_us / US_PER_S, polarity, intervals, series, active,
-        _active_windows(part_us), bursts, pixels,
-    )  # fmt: skip
-
-
-def _active_windows(part_us: int) -> int:
-    """Windows of `ACTIVE_US` that are whole in a part; a shorter part is one."""
-    return max(1, part_us // ACTIVE_US)
-
-
-def _part(
-    events: NDArray[np.void], begin_us: int, part_us: int, last_us: NDArray[np.int64], rows: int, cols: int
-) -> tuple[NDArray, ...]:
-    """Sums over a part; `last_us` [pixel], time of the last event of each pixel or −1, goes on."""
-    t_us, x, y = events["t_us"] - begin_us, events["x"].astype(np.int64), events["y"].astype(np.int64)
-    pixel = y * cols + x
-    on = np.count_nonzero(events["polarity"] > 0)
-    count = np.bincount(pixel, minlength=rows * cols).astype(np.uint32)
-    # events in successive windows; the rest of the part after the last whole one is left out
-    series = np.bincount(t_us // WINDOW_US, minlength=part_us // WINDOW_US)[: part_us // WINDOW_US]
-    # by pixel, then by time: the interval before each event, for the first one of a pixel from the part before
-    order = np.argsort(pixel, kind="stable")
-    own, times = pixel[order], t_us[order] + begin_us
-    first = np.diff(own, prepend=-1) != 0
-    before_us = np.where(first, last_us[own], np.append(0, times[:-1])[: own.size])
-    gap = (times - before_us)[before_us >= 0]
-    intervals = np.histogram(np.maximum(gap, 1), INTERVALS_US)[0]
-    # the last event of each pixel, for the next part
-    ends = np.append(first[1:], True)[: own.size]
-    last_us[own[ends]] = times[ends]
-    # bursts: successive events of a pixel without a long gap, counted by their lengths
-    starts = np.flatnonzero(first | (times - before_us > GAP_US))
-    length = np.diff(np.append(starts, own.size))
-    bursts = np.bincount(np.minimum(length, LONGEST), minlength=LONGEST + 1)
-    # pixels active in a whole window, each once; with each neighbour, the windows in which both are
-    whole = t_us // ACTIVE_US < _active_windows(part_us)
-    key = np.unique((t_us[whole] // ACTIVE_US) * (rows * cols) + pixel[whole])
-    row, col = np.divmod(key % (rows * cols), cols)
-    active = [int(key.size)]
-    for down, right in NEIGHBOURS:
-        fits = (row + down < rows) & (col + right < cols)
-        active.append(int(np.count_nonzero(np.isin(key[fits] + down * cols + right, key, assume_unique=True))))
-    return np.array([on, events.size - on]), intervals, series, np.array(active), bursts, count
-
+from hesim_render.measure.event_statistics import INTERVALS_US, LAGS, NEIGHBOURS, PARTS, EventStatistics
 
 #: Draws of the bootstrap, and hot pixels: so many times the usual rate.
 _DRAWS, _SEED, _HOT = 200, 1, 10.0
@@ -182,7 +37,8 @@ class EventDistance:
     name, definition : what it is, and how it is defined.
     value : distance, 0 for equal streams.
     interval_95 : of the true distance, by the bootstrap; from 0 where the streams do not differ.
-    within : distance of two draws of the first stream, of which 95 of 100 are below.
+    within : distance of two draws of the first stream, of which 95 of 100 are below; of shares of pixels, of
+        such shares of equal sensors.
     first, second : what it is the distance of, where that is a number.
     """
 
@@ -221,20 +77,57 @@ def event_distances(first: EventStatistics, second: EventStatistics) -> list[Eve
     result = []
     for name, definition, figure, distance, is_number, number in _FIGURES:
         a, b = figure(first, whole), figure(second, whole)
+        value, numbers = float(distance(a, b)), (float(a[0]), float(b[0])) if is_number else (None, None)
+        if figure is _hot:
+            below, above = _margins(float(a[0]), float(b[0]), first.pixels.shape[1], second.pixels.shape[1])
+            interval = (max(value - below, 0.0), max(value + above, below - value))
+            result.append(EventDistance(name, definition, value, interval, below, *numbers))
+            continue
         ours, again = ([figure(first, draw) for draw in part] for part in draws[:2])
         theirs = [figure(second, draw) for draw in draws[2]]
         spread = [distance(x, y) for x, y in zip(ours, theirs, strict=True)]
-        own = [distance(x, y) for x, y in zip(ours, again, strict=True)]
+        own = np.square([distance(x, y) for x, y in zip(ours, again, strict=True)])
         # what is in none of n has a share of 3/n at most
         rare = 0.0 if number is None else 3.0 / max(float(min(number(first), number(second))), 1.0)
-        value, within = float(distance(a, b)), max(_WIDER * float(np.percentile(own, 95)), rare)
+        within = max(_limit(own, len(a)), rare)
         # noise makes distances larger, those of drawn parts once more: the lower end has that taken off
         middle, top = np.percentile(spread, (50, 97.5))
-        low = max(value - _WIDER * float(top - min(middle, value)), 0.0) if value > within else 0.0
-        high = value + max(_WIDER * float(top - middle), rare)
-        numbers = (float(a[0]), float(b[0])) if is_number else (None, None)
+        least = min(float(middle), value)
+        low = max(value - _WIDER * float(top - least), 0.0) if value > within else 0.0
+        # draws of a single number near 0 fold back at it, which brings the median of their distances nearer to the top
+        high = value + max(_WIDER * float(top - (least if len(a) == 1 else middle)), rare)
         result.append(EventDistance(name, definition, value, (low, high), within, *numbers))
     return result
+
+
+def _limit(squares: NDArray[np.float64], length: int) -> float:
+    """Distance that 95 of 100 draws keep below, from the squares of distances of figures of so many numbers.
+
+    A square is like a sum of the squares of m normal numbers, where mean and variance tell m [satterthwaite1946]. By
+    chance 20 parts make numbers vary alike, and show m / (1 + (m + 1)/19) of them. Each is known by 19 degrees of
+    freedom.
+    """
+    free, mean = PARTS - 1, float(np.mean(squares))
+    shown = float(np.clip(2 * mean**2 / max(float(np.var(squares)), 1e-300), 1.0, free / 2))
+    count = min(shown * PARTS / (free - shown), float(length))
+    return float(np.sqrt(mean * PARTS / free * f_law.ppf(0.95, count, count * free)))
+
+
+def _margins(one: float, other: float, one_of: int, other_of: int) -> tuple[float, float]:
+    """How far the difference of two shares may lie below and above that of their laws, in 95 of 100 cases.
+
+    Parameters
+    ----------
+    one, other : shares of pixels, each of which is one of `one_of` or `other_of` drawn at random.
+    """
+    # bounds of each share [wilson1927], and of the difference of the larger and the smaller one [newcombe1998]
+    ends = []
+    for share, number in sorted(((one, one_of), (other, other_of))):
+        z2 = float(norm.ppf(0.975)) ** 2 / number
+        half = np.sqrt(z2 * (share * (1 - share) + z2 / 4))
+        ends.append((share - (share + z2 / 2 - half) / (1 + z2), (share + z2 / 2 + half) / (1 + z2) - share))
+    (small_down, small_up), (large_down, large_up) = ends
+    return float(np.hypot(large_down, small_up)), float(np.hypot(large_up, small_down))
 
 
 def _rate(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
@@ -251,7 +144,11 @@ def _cumulative(counts: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def _intervals(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
-    return _cumulative(one.intervals[draw].sum(axis=0))
+    # of the intervals that reach an age, the share that ends at it [kaplan1958]: each part tells it without bias, while
+    # of those that end in the first parts more are short; ages beyond half of the time have few parts
+    ended, at_risk = one.intervals[draw].sum(axis=0), one.at_risk[draw].sum(axis=0)
+    seen = INTERVALS_US[1:] <= PARTS / 2 * one.seconds * US_PER_S
+    return np.asarray(1 - np.cumprod(1 - ended / np.maximum(np.maximum(at_risk, ended), 1e-300))[seen])
 
 
 def _bursts(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
@@ -290,6 +187,12 @@ def _difference(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(np.abs(a - b).max())
 
 
+def _difference_of_both(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Of ages that both streams show, if one of them is longer."""
+    count = min(len(a), len(b))
+    return _difference(a[:count], b[:count])
+
+
 def _ratio(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(np.abs(np.log(np.maximum(a, 1e-300) / np.maximum(b, 1e-300))).max())
 
@@ -310,8 +213,8 @@ _Figure = tuple[
 _FIGURES: Sequence[_Figure] = (
     ("rate", "|ln| of the ratio of the events a pixel and second", _rate, _ratio, True, None),
     (
-        "intervals", "Kolmogorov-Smirnov distance of the intervals between events of a pixel",
-        _intervals, _difference, False, lambda one: one.intervals.sum(),
+        "intervals", "Kolmogorov-Smirnov distance of intervals between events of a pixel, up to half of the time",
+        _intervals, _difference_of_both, False, lambda one: one.intervals.sum(),
     ),
     ("polarity", "difference of (ON - OFF)/(ON + OFF)", _asymmetry, _difference, True, None),
     (
@@ -324,7 +227,7 @@ _FIGURES: Sequence[_Figure] = (
     ),
     (
         "hot pixels", "difference of the shares of pixels above ten times the usual rate",
-        _hot, _difference, True, lambda one: one.pixels.shape[1],
+        _hot, _difference, True, None,
     ),
     (
         "bursts", "Kolmogorov-Smirnov distance of the lengths of bursts, gaps up to 1 ms",
