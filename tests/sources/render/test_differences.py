@@ -205,6 +205,11 @@ def test_pixels_with_small_objects_are_rendered_by_themselves():
 def test_anchors_lie_at_multiples_of_64_ms_or_of_four_blocks():
     begin = np.array([129_999.0, 130_099, 130_199])
     assert anchor_us(begin, begin + 1, False) == (127_999, 128_000)
+    # the last window of a block has an anchor of its own, with the period of the whole block
+    ends = np.array([124_800.0, 127_000, 128_300])
+    assert anchor_us(ends - [7, 8, 9], ends, False, -1) == (127_991, 128_000)
+    slow = ends * [1, 1, 2]
+    assert anchor_us(slow - 700, slow, True, -1) == (-700, 0)
     ticks = np.arange(17) * 2000.0 + 130_000  # a block of 32 ms
     assert period_us(ticks, True) == 128_000 and anchor_us(ticks - 700, ticks, True) == (127_300, 128_000)
     # blocks of instants have different lengths, and one period

@@ -442,7 +442,7 @@ def test_held_windows_are_knots_and_the_ends_of_courses():
     """Pixel 0: an edge is followed from window 3, which is held of window 1, to window 6. Pixel 1: window 4 is held of
     window 2. Everything else lies on straight lines.
     """
-    centre = 220_000 + 80 * np.array([50.0, 90, 150, 180, 260, 300, 390, 450])
+    centre = 220_000 + 70 * np.array([50.0, 90, 150, 180, 260, 300, 390, 450])
     block = Block(centre - 3, centre + 3, np.arange(8) > 0)
     rendered = np.zeros((8, 2), np.bool_)
     rendered[[0, -1]] = rendered[[1, 6], 0] = rendered[[2, 6], 1] = True
@@ -456,7 +456,7 @@ def test_held_windows_are_knots_and_the_ends_of_courses():
     what = SimpleNamespace(rendered=rendered)
     what.until = lambda window: what
     renderer = SimpleNamespace(
-        has_ticks=False, look_stride=4, pilot=lambda *_: (None, None), plan=lambda *_, is_knot, windows: what,
+        has_ticks=False, look_stride=4, pilot=lambda *_, ending: (None, None), plan=lambda *_, is_knot, windows: what,
         follow=lambda *_: (what, None, of_edge, held), render=lambda *_, first, fit: (flux, None),
     )  # fmt: skip
     blocks = Blocks.__new__(Blocks)

@@ -111,6 +111,7 @@ class AdaptiveRenderer:
         anchored: Anchored | None = None,
         stride: int = 1,
         known: PilotFlux | None = None,
+        ending: Anchored | None = None,
     ) -> tuple[Pilot, NDArray[np.bool_]]:
         """Pilot pass of a band in listed windows; see `take_pilot`."""
         before, cols = self.tracer.rays_done, self._sensor.spec.geometry.cols
@@ -126,7 +127,7 @@ class AdaptiveRenderer:
         steps, few = len(numbers) - 1, 1
         if self.has_ticks and steps > 1:
             few = self._clock.windows_of_a_pixel(*windows.span_us, steps)
-        pilot, near = take_pilot(*of, span_us, looks, anchored, known, stride, wanted, band.mild, few)
+        pilot, near = take_pilot(*of, span_us, looks, anchored, known, stride, wanted, band.mild, few, ending)
         if band.apart and pilot.windows > 2:
             # no neighbour tells when deep shadow ends
             seen = pilot.steady_flux, pilot.unshadowed

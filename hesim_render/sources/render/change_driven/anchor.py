@@ -24,11 +24,20 @@ def period_us(end_us: NDArray[np.float64], has_ticks: bool) -> float:
     return max(_PERIOD_US, _BLOCKS * float(end_us[-1] - end_us[0])) if has_ticks else _PERIOD_US
 
 
-def anchor_us(begin_us: NDArray[np.float64], end_us: NDArray[np.float64], has_ticks: bool) -> tuple[float, float]:
-    """Begin and end of the anchor of a block, µs: a window as long as the first of the block."""
-    end, period = float(end_us[0]), period_us(end_us, has_ticks)
+def anchor_us(
+    begin_us: NDArray[np.float64], end_us: NDArray[np.float64], has_ticks: bool, window: int = 0
+) -> tuple[float, float]:
+    """Begin and end of the anchor of a window of a block, µs: a window as long as this one.
+
+    Parameters
+    ----------
+    begin_us, end_us : [w], the windows of the block, µs.
+    has_ticks : True if they may be ticks.
+    window : number of the window, the first or the last one.
+    """
+    end, period = float(end_us[window]), period_us(end_us, has_ticks)
     last = float(np.floor(end / period) * period)
-    return last - (end - float(begin_us[0])), last
+    return last - (end - float(begin_us[window])), last
 
 
 class Anchor:
@@ -67,7 +76,7 @@ class Anchor:
         self._means: dict[tuple[int, bool], tuple[PairFlux, NDArray[np.bool_]]] = {}
 
     def render(self, windows: Windows, what: Plan, first: Flux | None, out: Flux) -> None:
-        """Render the differences of a plan: of the first and the last window to the anchor, of others to the first.
+        """Render the differences of a plan: of the first and the last window to this anchor, of others to the first.
 
         Parameters
         ----------

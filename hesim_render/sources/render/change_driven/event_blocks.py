@@ -11,7 +11,7 @@ from itertools import zip_longest
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.mosaic.schedule import Block
+from hesim_render.mosaic.schedule import BLOCK_CELLS, CELL_US, Block
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us
 from hesim_render.sources.render.change_driven.estimates import Flux
@@ -20,6 +20,8 @@ from hesim_render.sources.render.change_driven.windows import Windows
 #: Largest number of intervals of a block of an asynchronous sensor. The last window of each block is rendered at all
 #: pixels, so that fewer blocks cost less; of a band of pixels, the plan of all windows is held in memory.
 INTERVALS = 64
+#: Longest block of an asynchronous sensor, µs.
+_LONGEST_US = BLOCK_CELLS * CELL_US
 #: Part of the pixels that may be constant and yet be traced in each block, so that the first pilot of all goes on.
 FEW = 1 / 256
 
@@ -79,18 +81,26 @@ class Blocks:
         parts: list[tuple[NDArray[np.int64], Knots]] = []
         # interpolation runs between the middles of windows
         centre = 0.5 * (block.begin_us + block.end_us)
-        span_us = anchor_us(block.begin_us, block.end_us, renderer.has_ticks)
+        # anchors of the first and of the last window, which is the first of the next block
+        span_us, end_us = (anchor_us(block.begin_us, block.end_us, renderer.has_ticks, k) for k in (0, -1))
+        last = windows.size - 1
         for number, band in enumerate(self._bands):
             # a new anchor every 64 ms; the old one is no longer compared with
             if self._anchors[number].span_us != span_us:
                 self._anchors[number] = Anchor(renderer, band, span_us, near_us=windows.span_us)
-            anchor = self._anchors[number]
+            anchor = ending = self._anchors[number]
             first = self._last.at(band.place) if is_next else None
             if first is not None and windows.size == 1:
                 parts.append((band.place, Knots.of(first, np.ones((1, band.place.size), np.bool_), centre)))
                 continue
             numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.sites.size))
-            pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride)
+            if end_us != span_us:
+                # what the next block will be compared with, which is no longer than this one or 32 ms
+                near_us = end_us[0], end_us[1] + max(float(np.ptp(block.end_us)), _LONGEST_US)
+                ending = self._anchors[number] = Anchor(renderer, band, end_us, near_us=near_us)
+            pilot, _ = renderer.pilot(
+                band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride, ending=ending.pilot
+            )
             # what lies behind the last wanted window, at the end of a run, is not rendered
             what = renderer.plan(pilot, band, is_knot=True, windows=windows).until(
                 int(np.flatnonzero(block.wanted)[-1])
@@ -104,14 +114,21 @@ class Blocks:
                 anchor.render(windows, what.first(), None, first)
             # windows between two fits of one edge, and those that show what an earlier one does, drop out of the plan
             what, fit, followed, held = renderer.follow(band, windows, numbers, what)
-            flux, _ = renderer.render(band, windows, numbers, what, first=first, fit=fit)
+            todo, known = what, what.rendered.copy()
+            if ending is not anchor and end_us == (block.begin_us[-1], block.end_us[-1]):
+                # the last window is the anchor of the next block
+                place = np.flatnonzero(what.rendered[last])
+                todo = what.without(np.full(place.size, last), place)
+            flux, _ = renderer.render(band, windows, numbers, todo, first=first, fit=fit)
             # differences are put beside the pairs that were rendered by themselves
-            anchor.render(windows, what, first, flux)
+            ending.render(windows, todo, first, flux)
+            if todo is not what:
+                for values, own in zip(flux.arrays, ending.flux_of(place).arrays, strict=True):
+                    values[last, place] = own[0]
             # a fit of an edge may be held
             held.fill(flux)
             followed.fill(flux, centre)
             # knots are windows that were rendered, those that an edge was followed through, and those that were held
-            known = what.rendered.copy()
             known[followed.window, followed.pixel] = True
             known[held.window, held.pixel] = True
             parts.append((band.place, Knots.of(flux, known, centre)))

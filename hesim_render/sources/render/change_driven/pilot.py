@@ -74,7 +74,7 @@ class Anchored:
 class Change:
     """Differences of the pilot's rays to the same rays in another window, arrays [window, site], e⁻/s.
 
-    The first and the last window are compared with the anchor of the block, all others with its first window.
+    The first and the last window are compared with their anchors, all others with the first window.
 
     Parameters
     ----------
@@ -151,6 +151,7 @@ def take_pilot(
     wanted: Wanted | None = None,
     mild: bool = False,
     few_stride: int = 1,
+    ending: Anchored | None = None,
 ) -> tuple[Pilot, NDArray[np.bool_]]:
     """Trace the pilot pass.
 
@@ -162,12 +163,13 @@ def take_pilot(
     width_px : width of the area in which the rays start, px.
     span_us : interval around all windows for which `near` is computed, µs; None: not computed.
     extra_looks : for each window, the sites that get extra rays; see `Zoom`.
-    anchored : pilot of the anchor with which the first and the last window are compared; None: nothing is compared.
+    anchored : pilot of the anchor with which the first window is compared; None: nothing is compared.
     known : results of the first window, where they are known and nothing is compared.
     stride : number of windows from one look to the next; between two looks that show the same, nothing is traced.
     wanted : maps the flux of each site to the wanted error of a pair, both e⁻/s; needed where `stride` is above 1.
     mild : take the mild scatter, see `PilotFlux`.
     few_stride : number of windows from one look of few rays to the next, see `windows_with_changes`.
+    ending : pilot of the anchor with which the last window is compared; None: that of the first window.
 
     Returns
     -------
@@ -176,6 +178,7 @@ def take_pilot(
         or if anything moves in front of a lens that spreads light (`RayFactory.spreads`).
     """
     count, every, given = numbers.shape[0], np.arange(sites.size), (windows, rays, width_px)
+    ending = anchored if ending is None else ending
     own_rays: PilotRays | None = None
     if known is not None:
         first = known
@@ -198,8 +201,8 @@ def take_pilot(
     def look(window: NDArray[np.int64], place: NDArray[np.int64]) -> PilotFlux:
         """Trace sites in windows other than the first."""
         compared = None
-        if anchored is not None and own_rays is not None:
-            compared = joined(own_rays, anchored.rays), place + np.where(window == count - 1, sites.size, 0)
+        if ending is not None and own_rays is not None:
+            compared = joined(own_rays, ending.rays), place + np.where(window == count - 1, sites.size, 0)
         return tracer.pilot(
             sites.index[place],
             numbers[window, place],
@@ -227,13 +230,12 @@ def take_pilot(
     tables = [looks.tables[name] for name in STATISTICS]
     pilot = Pilot(tables[0], tables[1], tables[2], tables[3], tables[4])
     change = None
-    if anchored is not None:
-        # inner windows against the first one, the first and the last against the anchor
+    if anchored is not None and ending is not None:
+        # inner windows against the first one, the last and the first against their anchors
         means = [values - values[:1] for values in (pilot.controlled, pilot.plain)]
-        for mean, values, other in zip(
-            means, (pilot.controlled, pilot.plain), (anchored.flux.controlled, anchored.flux.plain), strict=True
-        ):
-            mean[[0, -1]] = values[[0, -1]] - other
+        for window, other in ((-1, ending.flux), (0, anchored.flux)):
+            means[0][window] = pilot.controlled[window] - other.controlled
+            means[1][window] = pilot.plain[window] - other.plain
         change = Change(means[0], means[1], looks.tables[CHANGES[0]], looks.tables[CHANGES[1]])
     # extra rays where small objects pass, which the few rays of the pilot may miss
     near_by = [(window, one) for window, row in enumerate(extra_looks) for one in row if one.place.size]
