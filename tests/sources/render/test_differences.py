@@ -341,19 +341,25 @@ def test_a_pilot_says_whether_the_camera_moves():
     assert take_pilot(tracer, *given)[0].all_move
 
 
+@pytest.mark.parametrize("moves_on", [False, True])
 @pytest.mark.parametrize(("width_px", "reach"), [(1.09, (2, 1)), (1.15, (2, 0)), (1.25, (0, 0))])
-def test_what_a_pilot_compares_and_between_which_looks_it_traces(width_px, reach):
+def test_what_a_pilot_compares_and_between_which_looks_it_traces(width_px, reach, moves_on):
     """Nine windows and looks at every fourth, 11×11 sites: one changes from window 6 on, one is far from all motion."""
     sites, far = sites_of(), 10 * 11 + 10
     light, near = np.full((9, 121), 250.0, np.float32), np.ones(121, bool)
     light[6:, CENTRE], near[far] = 700.0, False
-    tracer, anchor = MadeUp(light, near), PilotFlux.empty(121)
+    tracer, (anchor, later) = MadeUp(light, near), (PilotFlux.empty(121) for _ in range(2))
     anchor.controlled[:], anchor.plain[:] = 240.0, 90.0
+    later.controlled[:], later.plain[:] = 170.0, 30.0
     zeros = jit().Float(np.zeros(16 * 121, np.float32))
-    anchored = Anchored(anchor, PilotRays(zeros, zeros, 16, (1.0, 2.0)), (-3.0, -2.0))
+    anchored, other = (
+        Anchored(each, PilotRays(zeros, zeros, 16, (1.0, 2.0)), (-3.0, -2.0)) for each in (anchor, later)
+    )
+    ending = other if moves_on else None
     numbers = np.repeat(np.arange(9)[:, None], 121, axis=1)
     windows = Windows(np.arange(9.0), np.arange(9.0) + 1)
-    pilot, _ = take_pilot(tracer, sites, windows, numbers, 16, width_px, None, anchored=anchored, stride=4)
+    given = tracer, sites, windows, numbers, 16, width_px, None
+    pilot, _ = take_pilot(*given, anchored=anchored, stride=4, ending=ending)
     np.testing.assert_array_equal(pilot.controlled, light)
     assert not pilot.all_move
     row, col = np.indices((11, 11))
@@ -361,16 +367,20 @@ def test_what_a_pilot_compares_and_between_which_looks_it_traces(width_px, reach
     busy, beside = (np.flatnonzero(((abs(row - 5) <= k) & (abs(col - 5) <= k)).ravel()) for k in reach)
     looks = [(window, site) for window in (0, 4, 8) for site in range(121) if window == 0 or site != far]
     halved = [(6, site) for site in busy] + [(5, site) for site in beside]
+    # what rests is compared with the anchor of the last window, where that is another one
+    halved += [(8, far)] * moves_on
     assert sorted(tracer.traced) == sorted([*looks, *halved])
     # the ends are compared with the anchor, those between with the first window
     scatter, site = pilot.change.controlled_scatter, np.arange(121)
     near_by = site != far
     np.testing.assert_array_equal(scatter[0], 3000 + site)
     np.testing.assert_array_equal(scatter[8, near_by], (3000 + site + 121)[near_by])
-    assert scatter[8, far] == scatter[0, far] and np.all(scatter[1:4] == 0) and np.all(scatter[1:8, far] == 0)
+    assert scatter[8, far] == (3000 + far + 121 if moves_on else scatter[0, far])
+    assert np.all(scatter[1:4] == 0) and np.all(scatter[1:8, far] == 0)
     np.testing.assert_array_equal(scatter[4:8, near_by], np.tile((3000 + site)[near_by], (4, 1)))
-    np.testing.assert_array_equal(pilot.change.controlled[[0, 8]], light[[0, 8]] - 240)
-    np.testing.assert_array_equal(pilot.change.plain[8], 0.5 * light[8] - 90)
+    np.testing.assert_array_equal(pilot.change.controlled[0], light[0] - 240)
+    np.testing.assert_array_equal(pilot.change.controlled[8], light[8] - (170 if moves_on else 240))
+    np.testing.assert_array_equal(pilot.change.plain[8], 0.5 * light[8] - (30 if moves_on else 90))
     np.testing.assert_array_equal(pilot.change.controlled[1:8], light[1:8] - 250)
 
 

@@ -7,7 +7,9 @@ from test_change_driven import noisy
 
 import hesim_render as hr
 from hesim_render.mosaic.schedule import tick_blocks
+from hesim_render.sources.render.change_driven.anchor import Anchor
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.transport import outlines
 
 
@@ -77,3 +79,28 @@ def test_values_are_the_same_whichever_side_of_an_anchor_a_run_begins(tick_us, b
     np.testing.assert_array_equal(later_us, ends_us[ends_us > split_us])
     sooner_us, sooner = run(sensor, begin_us, split_us)
     np.testing.assert_array_equal(sooner, whole[np.isin(ends_us, sooner_us)])
+
+
+@pytest.mark.parametrize("tick_us", [1250, None])
+def test_each_anchor_is_made_once(tick_us, monkeypatch):
+    """Anchors of the two blocks about 64 ms, or about 80 ms of ticks of 1.25 ms: their pilots, and that of the first
+    window of the run; the second block begins in its anchor.
+    """
+    sensor = noisy(26, 18) if tick_us else hr.load_sensor("davis346").crop(26, 18, 5, 3)
+    spans_us, pilots, made, traced = [], [], Anchor.__init__, PairTracer.pilot_rays
+
+    def noted(self, renderer, band, span_us, *others, **more):
+        spans_us.append(span_us)
+        made(self, renderer, band, span_us, *others, **more)
+
+    def counted(self, *given, **more):
+        pilots.append(given[0].size)
+        return traced(self, *given, **more)
+
+    monkeypatch.setattr(Anchor, "__init__", noted)
+    monkeypatch.setattr(PairTracer, "pilot_rays", counted)
+    at_us = 80_000 if tick_us else 64_000
+    run(sensor, at_us - 2500, at_us + 2500)
+    length_us = spans_us[0][1] - spans_us[0][0]
+    assert spans_us == [(-length_us, 0), (at_us - length_us, at_us)]
+    assert len(pilots) == (3 if tick_us else 4)

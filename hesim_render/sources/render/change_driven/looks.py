@@ -53,6 +53,12 @@ class Looks:
         self._in_all([self._last])
         return PilotFlux(met=self._near, **{name: values[self._last] for name, values in self.tables.items()})
 
+    def compare_end(self, place: NDArray[np.int64]) -> None:
+        """Compare what some sites show in the last window with its anchor; what they show stays."""
+        seen = self._trace(np.full(place.size, self._last), place)
+        for name in CHANGES:
+            self.tables[name][self._last, place] = getattr(seen, name)
+
     def put(self, window: int, seen: PilotFlux) -> None:
         """Put in what all sites show in a window; their changes stay."""
         for name in STATISTICS:

@@ -226,6 +226,9 @@ def take_pilot(
             looks.wherever(windows_with_changes(*of, shadows[0], few_stride))
         else:
             looks.every(stride, sites, wanted, 0.5 * (width_px - 1))
+    if ending is not anchored and not near.all():
+        # what rests shows the same in the last window as in the first, but not the same difference to another anchor
+        looks.compare_end(np.flatnonzero(~near))
     # statistics of all windows, [window, site]
     tables = [looks.tables[name] for name in STATISTICS]
     pilot = Pilot(tables[0], tables[1], tables[2], tables[3], tables[4])
