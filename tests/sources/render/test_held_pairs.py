@@ -456,15 +456,17 @@ def test_held_windows_are_knots_and_the_ends_of_courses():
     what = SimpleNamespace(rendered=rendered)
     what.until = lambda window: what
     renderer = SimpleNamespace(
-        has_ticks=False, look_stride=4, pilot=lambda *_, ending: (None, None), plan=lambda *_, is_knot, windows: what,
-        follow=lambda *_: (what, None, of_edge, held), render=lambda *_, first, fit: (flux, None),
+        has_ticks=False, look_stride=4, pilot=lambda *_, ending: (None, None),
+        plan=lambda *_, is_knot, windows, shares: what, follow=lambda *_: (what, None, of_edge, held),
+        render=lambda *_, first, fit, link: (flux, None),
     )  # fmt: skip
     blocks = Blocks.__new__(Blocks)
     blocks._renderer = renderer
     blocks._bands = [SimpleNamespace(place=np.arange(2), sites=SimpleNamespace(size=2))]
     # compared with the last multiple of 64 ms, though the block is longer than 16 ms
     span_us = 191_994.0, 192_000.0
-    blocks._anchors = [SimpleNamespace(span_us=span_us, pilot=None, render=lambda *_: None)]
+    anchor = SimpleNamespace(span_us=span_us, pilot=None, shares=None, render=lambda *_: None, link=lambda *_: None)
+    blocks._anchors = [anchor]
     blocks._time, blocks._last = (centre[0] - 3, centre[0] + 3), Flux.zeros(1, 2)
     got = blocks.take(block)
     for number, values in enumerate(before.arrays):

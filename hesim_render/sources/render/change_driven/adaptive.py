@@ -1,6 +1,6 @@
 """Adaptive rendering of listed pixels: pilot pass, plan, and the rays that the plan names."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,11 +17,12 @@ from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Band, Counts, Flux, Still
 from hesim_render.sources.render.change_driven.held_pairs import HeldPairs, held_pairs
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites, of_own_row, turns
-from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
-from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
+from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux
 from hesim_render.sources.render.change_driven.pilot import Anchored, Pilot, take_pilot
-from hesim_render.sources.render.change_driven.plan import Plan, plan
+from hesim_render.sources.render.change_driven.plan import Plan, Shares, plan
 from hesim_render.sources.render.change_driven.sample_instants import MotionClock
+from hesim_render.sources.render.change_driven.shared_tracer import SharedTracer
+from hesim_render.sources.render.change_driven.sharing import Sharing
 from hesim_render.sources.render.change_driven.small_objects import Zoom
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -29,6 +30,8 @@ from hesim_render.sources.render.change_driven.windows import Windows
 #: Pixels that are processed at a time, to bound memory.
 BAND_PIXELS = 1 << 17
 _ALWAYS_US = (-np.inf, np.inf)
+#: See `Anchor.link`.
+Link = Callable[[Plan, NDArray, NDArray, PairEdges | None, PairFlux], NDArray[np.float32]]
 #: Part of the wanted error below which a flux counts as no light at all.
 _NOTHING = np.float32(1e-3)
 
@@ -53,9 +56,10 @@ class AdaptiveRenderer:
     counts : work done so far.
     look_stride : windows from one look of the pilot to the next.
     has_ticks : True if event pixels compare at a fixed tick.
+    sharing : pixels that share what their paths find.
     """
 
-    def __init__(self, tracer: PairTracer, noise: Noise, quality: float, tuning: Tuning, clock: MotionClock) -> None:
+    def __init__(self, tracer: SharedTracer, noise: Noise, quality: float, tuning: Tuning, clock: MotionClock) -> None:
         self.tracer, self.noise, self.quality, self._clock = tracer, noise, quality, clock
         self.gain = Gain(*(tuning.diffuse_gain if tracer.is_diffuse else tuning.path_gain))
         self.counts = Counts()
@@ -70,6 +74,7 @@ class AdaptiveRenderer:
             tuning = replace(tuning, pilot_rays=tuning.path_pilot_rays)
         self.tuning = tuning
         self.zoom = Zoom(tracer.view, tracer.camera, tracer.parts.groups, tuning, rays.can_aim, rays.blur_px)
+        self.sharing = Sharing(tracer, noise, quality, self.gain, tuning)
         self._kept: dict[Role, Still] = {}
 
     def still(self, role: Role) -> Still:
@@ -149,13 +154,15 @@ class AdaptiveRenderer:
         """Width of the area in which pilot rays of a band start, px."""
         return self.tuning.lone_footprint_px if band.apart else self.tuning.footprint_px
 
-    def plan(self, pilot: Pilot, band: Band, is_knot: bool, windows: Windows | None = None) -> Plan:
+    def plan(
+        self, pilot: Pilot, band: Band, is_knot: bool, windows: Windows | None = None, shares: Shares = None
+    ) -> Plan:
         """Which pairs of a band are rendered, with how many rays; see `plan`. Of the windows of a block, those between
         which the light of paths is a straight line are left out; this traces rays.
         """
         given = pilot, band.sites, band.unit, band.quality, self.gain, self.tuning
         # windows of synchronous sensors are too far apart for an edge to stay within a pixel
-        what = plan(*given, is_knot=is_knot, follows=self.look_stride > 1 and self.tracer.rays.is_box)
+        what = plan(*given, is_knot, self.look_stride > 1 and self.tracer.rays.is_box, shares)
         if not self.tracer.is_diffuse:
             # a highlight or a caustic may be there all the same
             dark = what.pilot < _NOTHING * what.wanted
@@ -221,6 +228,7 @@ class AdaptiveRenderer:
         span_us: tuple[float, float] | None = None,
         first: Flux | None = None,
         fit: EdgeFit | None = None,
+        link: Link | None = None,
     ) -> tuple[Flux, NDArray[np.bool_]]:
         """Render the pairs that a plan names, except differences, which need an anchor; see `Anchor.render`.
 
@@ -229,6 +237,7 @@ class AdaptiveRenderer:
         numbers : [w, n], window number of each pair.
         first : [1, n], flux in the first window, if it is already known.
         fit : lines of the pairs `fitted` of the plan, where they are known.
+        link : renders linked pairs as differences, see `Anchor.link`; None where there are none.
 
         Returns
         -------
@@ -236,29 +245,26 @@ class AdaptiveRenderer:
         met : [w, n], True if a path came near a moving object in `span_us`; False where nothing was rendered.
         """
         out, met = Flux.zeros(*what.rendered.shape), np.zeros(what.rendered.shape, np.bool_)
-        todo = what.rendered.copy()
+        todo = what.rendered & (what.differences.rays == 0)
         if first is not None:
             todo[0] = False
-        todo &= what.differences.rays == 0
         before = self.tracer.rays_done
         window, place = np.nonzero(todo)
         aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
         pairs = band.index[place], numbers[todo], windows
         rays, edges = self.rays_of(pairs, what, todo, aims, fit)
+        shared = None if what.shared is None else what.shared[todo]
         shadows = None if what.shadows is None else what.shadows[todo]
-        got = self.tracer.trace(
-            *(*pairs, rays, what.controlled[todo]), span_us=span_us, aims=aims, edges=edges, shadows=shadows
-        )
+        got = self.sharing.trace((*pairs, rays, what.controlled[todo]), shared, span_us, aims, edges, shadows)
+        error = what.error[todo] if link is None else link(what, todo, rays, edges, got)
         self.counts.rays += self.tracer.rays_done - before
         self.counts.pairs += place.size
         if not self.tracer.is_diffuse:
             # rays that saw nothing do not show that there is nothing: halves of 0 would state an error of 0
-            wanted = what.wanted[todo]
-            unseen = np.maximum(np.abs(got.half_a), np.abs(got.half_b)) < _NOTHING * wanted
-            got.half_a[unseen] += wanted[unseen]
-            got.half_b[unseen] -= wanted[unseen]
+            got.set_apart(_NOTHING, what.wanted[todo])
         out.half_a[todo], out.half_b[todo], met[todo] = got.half_a, got.half_b, got.met
         np.copyto(out.error, what.error)
+        out.error[todo] = error
         if first is not None:
             for values, known in zip(out.arrays, first.arrays, strict=True):
                 values[0] = known[0]
@@ -333,6 +339,8 @@ class AdaptiveRenderer:
                     own_pilot = kept[-1][1].flux
                 pilot, near = self.pilot(band, windows, numbers, still.span_us, known=own_pilot)
                 what = self.plan(pilot, band, is_knot=role == "events")
+                if role == "events":
+                    what = self.sharing.planned(what, band, self.counts)
                 flux, met = self.render(band, windows, own[None], what, still.span_us)
                 out.put(place, flux)
                 if still.span_us is not None:

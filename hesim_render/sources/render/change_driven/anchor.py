@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
+from hesim_render.sources.render.change_driven.edges import PairEdges
 from hesim_render.sources.render.change_driven.estimates import Band, Flux
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, not_negative
 from hesim_render.sources.render.change_driven.pilot import Anchored
@@ -90,40 +91,100 @@ class Anchor:
         todo = what.rendered & (chosen.rays > 0)
         if first is not None:
             todo[0] = False
-        before, last = renderer.tracer.rays_done, todo.shape[0] - 1
-        number = np.arange(todo.shape[0])[:, None]
-        # ends of the block are compared with the anchor, the windows between them with the first window
-        for is_inner in (False, True):
-            some = todo & (((number > 0) & (number < last)) == is_inner)
-            window, place = np.nonzero(some)
-            if place.size == 0:
-                continue
-            rays, controlled = chosen.rays[some], chosen.controlled[some]
-            now = renderer.tracer.trace(band.index[place], window, windows, rays, controlled, signed=True)
+        before = renderer.tracer.rays_done
+        window, place = np.nonzero(todo)
+        if place.size == 0:
+            return
+        pairs = window, place, chosen.rays[todo], chosen.controlled[todo]
+        now = renderer.tracer.trace(band.index[place], window, windows, *pairs[2:], signed=True)
+        got, error = self.compared(windows, first, pairs, now)
+        out.half_a[todo], out.half_b[todo], out.error[todo] = (
+            got.half_a,
+            got.half_b,
+            np.hypot(error, chosen.error[todo]),
+        )
+        renderer.counts.rays += renderer.tracer.rays_done - before
+        renderer.counts.pairs += place.size
+
+    def link(
+        self,
+        windows: Windows,
+        first: Flux | None,
+        what: Plan,
+        todo: NDArray[np.bool_],
+        rays: NDArray[np.integer],
+        edges: PairEdges | None,
+        flux: PairFlux,
+    ) -> NDArray[np.float32]:
+        """Make differences of the linked pairs of a plan that were rendered by themselves.
+
+        Parameters
+        ----------
+        windows, first : see `render`.
+        what, todo : the plan, and the pairs [window, pixel] that were rendered.
+        rays : [k], numbers of rays of these.
+        edges : their lines; those that have one have less noise than most that they could be compared with, and stay.
+        flux : [k], changed in place.
+
+        Returns
+        -------
+        Expected errors, [k].
+        """
+        error, chosen = what.error[todo], what.differences
+        linked = np.flatnonzero(chosen.linked[todo] & (True if edges is None else ~edges.is_there))
+        if linked.size == 0:
+            return error
+        window, place = (values[linked] for values in np.nonzero(todo))
+        pairs = window, place, rays[linked], what.controlled[todo][linked]
+        moved, base = self.compared(windows, first, pairs, flux.at(linked))
+        flux.put_at(linked, moved)
+        error[linked] = np.hypot(base, chosen.error[todo][linked])
+        return error
+
+    def compared(
+        self, windows: Windows, first: Flux | None, pairs: tuple[NDArray, NDArray, NDArray, NDArray], now: PairFlux
+    ) -> tuple[PairFlux, NDArray[np.float32]]:
+        """Flux of pairs from the means of some rays in their windows, by the same rays in the windows that they are
+        compared with: ends of the block with the anchor, the windows between them with the first window.
+
+        Parameters
+        ----------
+        windows, first : see `render`.
+        pairs : window, place, number of rays and estimator of each pair, [k].
+        now : means of these rays.
+
+        Returns
+        -------
+        Flux, and the expected error of the other windows, [k].
+        """
+        window, place, rays, controlled = pairs
+        then, other, error = PairFlux.empty(place.size), PairFlux.empty(place.size), np.empty(place.size, np.float32)
+        inner = (window > 0) & (window < windows.size - 1)
+        for is_inner in np.unique(inner):
+            some = np.flatnonzero(inner == is_inner)
+            own, given = place[some], (rays[some], controlled[some])
             if is_inner:
                 assert first is not None
-                # the same rays of a pixel in the first window serve all others
-                # all inner windows of a pixel have one number of rays, so any of them tells it
-                pixel, own = np.unique(place, return_index=True)
-                of = band.index[pixel], np.zeros(pixel.size, np.int64), windows, rays[own], controlled[own]
-                then = renderer.tracer.trace(*of, signed=True).at(np.searchsorted(pixel, place))
-                base = first.at(place)
+                means, base = self._in_first(windows, own, *given), first.at(own)
             else:
-                then, base = self._means_of(place, rays, controlled), self.flux_of(place)
-            # the flux of the window that was compared with, and the difference of the same rays, for each half apart
-            halves = [
-                own[0] + (new - old)
-                for own, new, old in zip(
-                    base.arrays, (now.half_a, now.half_b), (then.half_a, then.half_b), strict=False
-                )
-            ]
-            got = PairFlux(halves[0], halves[1], now.met)
-            # a difference may be larger than the flux itself where both are near zero
-            not_negative(got)
-            out.half_a[some], out.half_b[some] = got.half_a, got.half_b
-            out.error[some] = np.hypot(base.error[0], chosen.error[some])
-        renderer.counts.rays += renderer.tracer.rays_done - before
-        renderer.counts.pairs += int(np.count_nonzero(todo))
+                means, base = self._means_of(own, *given), self.flux_of(own)
+            then.half_a[some], then.half_b[some] = means.half_a, means.half_b
+            other.half_a[some], other.half_b[some], error[some] = (values[0] for values in base.arrays)
+        # the flux of the window that was compared with, and the difference of the same rays, for each half apart
+        halves = other.half_a + (now.half_a - then.half_a), other.half_b + (now.half_b - then.half_b)
+        got = PairFlux(halves[0], halves[1], now.met)
+        # a difference may be larger than the flux itself where both are near zero
+        not_negative(got)
+        return got, error
+
+    def _in_first(
+        self, windows: Windows, place: NDArray[np.int64], rays: NDArray[np.integer], controlled: NDArray[np.bool_]
+    ) -> PairFlux:
+        """Means of numbers of rays of some pixels in the first window; the same rays serve all other windows."""
+        # each pixel once, by each number of rays and each estimator
+        distinct, which = np.unique(np.stack([place, rays, controlled]).astype(np.int64), axis=1, return_inverse=True)
+        of = self._band.index[distinct[0]], np.zeros(distinct.shape[1], np.int64), windows
+        return self._renderer.tracer.trace(*of, distinct[1], distinct[2] > 0, signed=True).at(which.ravel())
 
     def rays_of(self, what: Plan, todo: NDArray[np.bool_]) -> tuple[int, int, int]:
         """Rays of the differences `todo` of a plan, of those in the anchor to compare with, and of the flux there."""
@@ -143,8 +204,14 @@ class Anchor:
             renderer, band = self._renderer, self._band
             first = np.zeros((1, band.sites.size), np.int64)
             pilot, _ = renderer.pilot(band, self._windows, first, None, known=self.pilot.flux)
-            self._plan = renderer.plan(pilot, band, is_knot=True)
+            self._plan = renderer.sharing.planned(renderer.plan(pilot, band, is_knot=True), band, renderer.counts)
         return self._plan
+
+    @property
+    def shares(self) -> NDArray[np.bool_] | None:
+        """Pixels that share in the anchor, [n]; None where nothing is shared."""
+        shared = self._own_plan().shared if self._renderer.sharing.lattice is not None else None
+        return None if shared is None else shared[0]
 
     def flux_of(self, place: NDArray[np.int64]) -> Flux:
         """Flux of some pixels in the anchor, [1, n]."""

@@ -18,6 +18,8 @@ from hesim_render.sources.render.change_driven.neighbours import Sites
 from hesim_render.sources.render.change_driven.pilot import Pilot
 from hesim_render.sources.render.change_driven.tuning import Tuning
 
+#: Pixels [n] that share in the anchors of the first and of the last window; None if none do.
+Shares = tuple[NDArray[np.bool_], NDArray[np.bool_]] | None
 #: Scale of fluxes before they are squared, so that float32 can hold the squares.
 _SMALLER = np.float32(1e-4)
 
@@ -31,21 +33,25 @@ class Differences:
     rays : number of rays of each in either window, a power of two; 0 for pairs that are rendered by themselves.
     controlled : estimator of the difference, see `DiffuseIntegrator`.
     error : expected standard error of the difference, e⁻/s.
+    linked : pairs that are rendered with all their rays, and as differences of these where no line is found in them, as
+        the other window has less noise than they would have.
     """
 
     rays: NDArray[np.int16]
     controlled: NDArray[np.bool_]
     error: NDArray[np.float32]
+    linked: NDArray[np.bool_]
 
     def first(self) -> "Differences":
         """Those in the first window."""
-        return Differences(self.rays[:1], self.controlled[:1], self.error[:1])
+        return Differences(self.rays[:1], self.controlled[:1], self.error[:1], self.linked[:1])
 
     @classmethod
     def none(cls, windows: int, pixels: int) -> "Differences":
         """No differences."""
         shape = windows, pixels
-        return cls(np.zeros(shape, np.int16), np.zeros(shape, np.bool_), np.zeros(shape, np.float32))
+        rays, error = np.zeros(shape, np.int16), np.zeros(shape, np.float32)
+        return cls(rays, np.zeros(shape, np.bool_), error, np.zeros(shape, np.bool_))
 
 
 def difference_of(
@@ -112,6 +118,8 @@ def differences(
     rendered: NDArray[np.bool_],
     alone: NDArray[np.int16],
     tuning: Tuning,
+    alone_error: NDArray[np.float32] | None = None,
+    shares: Shares = None,
 ) -> Differences:
     """Choose the pairs that are rendered as differences: where that takes a small part of the rays.
 
@@ -120,7 +128,9 @@ def differences(
     pilot, sites, quality, tuning : see `plan`.
     units : [window, site], noise units, e⁻/s.
     rendered : [window, pixel], rendered pairs.
-    alone : [window, pixel], rays of pairs that are rendered by themselves.
+    alone, alone_error : [window, pixel], rays of pairs that are rendered by themselves, and their expected errors,
+        e⁻/s.
+    shares : see `plan`.
     """
     last = rendered.shape[0] - 1
     out = Differences.none(*rendered.shape)
@@ -142,19 +152,21 @@ def differences(
         pays = np.float32(tuning.difference_gain) * rays <= alone[window, some]
         out.rays[window, some] = np.where(pays, rays, 0)
         out.controlled[window, some], out.error[window, some] = controlled[chosen.listed], scatter
+    may = rendered.copy()
     for window, refined in enumerate(pilot.refined):
         # a small object passes: many rays look for it
         looked_at = np.zeros(sites.size, np.bool_)
         looked_at[refined.place] = True
-        out.rays[window, looked_at[sites.listed]] = 0
+        may[window, looked_at[sites.listed]] = False
     if pilot.aims is not None:
         # pairs with small objects in them have rays aimed at these, which a difference has not
-        which, place = np.nonzero(out.rays)
+        which, place = np.nonzero(may)
         is_aimed = pilot.aims.at(which, sites.listed[place]).count > 0
-        out.rays[which[is_aimed], place[is_aimed]] = 0
+        may[which[is_aimed], place[is_aimed]] = False
     if pilot.shadows is not None:
         # the rays to compare with do not know any shadows
-        out.rays[pilot.shadows[:, sites.listed] > 0] = 0
+        may &= pilot.shadows[:, sites.listed] == 0
+    out.rays[~may] = 0
     # all windows between take as many rays as the one that needs most, and together pay for those in the first window
     some = np.flatnonzero(out.rays[inner].any(axis=0))
     own = out.rays[inner, some]
@@ -162,6 +174,12 @@ def differences(
     # rays that all inner windows of a pixel save together, [pixel], against `most` rays once more in the first window
     saved = np.where(own > 0, alone[inner, some].astype(np.int32) - most, 0).sum(axis=0)
     out.rays[inner, some] = np.where((own > 0) & (saved > most), most, 0)
+    if shares is not None and alone_error is not None:
+        # where the other window has little noise, a pair is as far off as its difference; that may be less than alone
+        of_all = np.float32(tuning.difference_factor) * out.error / np.sqrt(np.maximum(alone, 1).astype(np.float32))
+        out.linked[:] = may & (out.rays == 0) & shares[0] & (of_all < alone_error)
+        out.linked[last] &= shares[1]
+        np.copyto(out.error, of_all, where=out.linked)
     # from the scatter of single differences to the error of their mean
     pairs = out.rays > 0
     out.error[pairs] *= np.float32(tuning.difference_factor) / np.sqrt(out.rays[pairs].astype(np.float32))

@@ -6,6 +6,7 @@ windows.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import zip_longest
 
 import numpy as np
@@ -102,7 +103,10 @@ class Blocks:
                 band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride, ending=ending.pilot
             )
             # what lies behind the last wanted window, at the end of a run, is not rendered
-            what = renderer.plan(pilot, band, is_knot=True, windows=windows).until(
+            shares = None
+            if anchor.shares is not None and ending.shares is not None:
+                shares = anchor.shares, ending.shares
+            what = renderer.plan(pilot, band, is_knot=True, windows=windows, shares=shares).until(
                 int(np.flatnonzero(block.wanted)[-1])
             )
             numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.place.size))
@@ -110,7 +114,8 @@ class Blocks:
                 first = anchor.flux_of(np.arange(band.place.size))
             if first is None:
                 # by itself, so that the other windows are traced by the calls of a run that comes from the block before
-                first = renderer.render(band, windows, numbers[:1], what.first())[0]
+                link = partial(anchor.link, windows, None)
+                first = renderer.render(band, windows, numbers[:1], what.first(), link=link)[0]
                 anchor.render(windows, what.first(), None, first)
             # windows between two fits of one edge, and those that show what an earlier one does, drop out of the plan
             what, fit, followed, held = renderer.follow(band, windows, numbers, what)
@@ -119,7 +124,8 @@ class Blocks:
                 # the last window is the anchor of the next block
                 place = np.flatnonzero(what.rendered[last])
                 todo = what.without(np.full(place.size, last), place)
-            flux, _ = renderer.render(band, windows, numbers, todo, first=first, fit=fit)
+            link = partial(ending.link, windows, first)
+            flux, _ = renderer.render(band, windows, numbers, todo, first=first, fit=fit, link=link)
             # differences are put beside the pairs that were rendered by themselves
             ending.render(windows, todo, first, flux)
             if todo is not what:

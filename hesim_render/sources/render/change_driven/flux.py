@@ -26,10 +26,10 @@ from hesim_render.sources.render.change_driven.estimates import Counts, Flux
 from hesim_render.sources.render.change_driven.event_blocks import INTERVALS, BlockFlux, Blocks
 from hesim_render.sources.render.change_driven.forecast import forecast
 from hesim_render.sources.render.change_driven.foresight import Foresight
-from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.references import References
 from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
 from hesim_render.sources.render.change_driven.sample_instants import MotionClock
+from hesim_render.sources.render.change_driven.shared_tracer import SharedTracer
 from hesim_render.sources.render.change_driven.tuning import TUNING, Tuning
 from hesim_render.sources.render.exact import require_finite, used_responses
 from hesim_render.sources.render.renderer import reported
@@ -89,7 +89,7 @@ class ChangeDrivenFlux:
         if not 0 < quality < float("inf"):
             raise RangeError("quality", quality, "a part of the sensor's noise, above 0")
         self.quality, self.seed, self.light, self._scene = quality, seed, light, scene
-        tracer = self._tracer = PairTracer(scene, sensor, seed, used_responses(sensor), progress, light=light)
+        tracer = self._tracer = SharedTracer(scene, sensor, seed, used_responses(sensor), progress, light=light)
         self.view, self.sensor = tracer.view, tracer.sensor
         self.is_static = not tracer.parts.groups and tracer.camera is None
         noise = Noise(self.sensor, 1.0 if light is None else light.highest, rests=self.is_static)

@@ -102,7 +102,10 @@ class Foresight:
             # the same plan as in a run, of which the rays are counted and not traced
             before, fit = self._tracer.rays_done, None
             block = windows if role == "events" and windows.size > 1 else None
-            what = renderer.plan(pilot, band, is_knot=role == "events", windows=block)
+            shares = None if anchor is None or anchor.shares is None else (anchor.shares, anchor.shares)
+            what = renderer.plan(pilot, band, is_knot=role == "events", windows=block, shares=shares)
+            if is_anchor:
+                what = renderer.sharing.planned(what, band, renderer.counts)
             what = what.until(windows.size - 1 if until is None else until)
             if windows.size > 1:
                 what, fit, *_ = renderer.follow(band, windows, numbers[:, : band.place.size], what)
@@ -118,6 +121,11 @@ class Foresight:
             before = self._tracer.rays_done
             each, _ = renderer.rays_of((band.index[place], window, windows), what, todo, aims, fit)
             rays[0] += int(each.sum(dtype=np.int64)) + self._tracer.rays_done - before
+            # what linked pairs are compared with: each pixel once, by each number of rays
+            linked = what.differences.linked[todo]
+            inner = (window > 0) & (window < windows.size - 1)
+            rays[0] += np.unique(np.stack([place, inner, each])[:, linked & inner], axis=1)[2].sum(dtype=np.int64)
+            rays[1] += each[linked & ~inner].sum(dtype=np.int64)
             traces += self._tracer.traces - started + _PICTURES
             self._pairs.append((band.index[place], begin_us[window], end_us[window], each.astype(np.int64)))
         renderer.counts, self._tracer.rays_done = counts, done

@@ -23,6 +23,7 @@ from hesim_render.sources.render.tracer import Tracer
 from hesim_render.sources.render.transport.diffuse import DiffuseIntegrator
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.paths import PathIntegrator
+from hesim_render.sources.render.transport.shared_paths import Groups
 from hesim_render.sources.render.transport.swept_boxes import Moment
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.spectrum import Spectrum
@@ -223,9 +224,10 @@ class PacketTracer(Tracer):
         key: UInt64,
         footprint: Float,
         aims: PairAims | PairEdges | None,
+        groups: Groups | None = None,
     ) -> tuple[_Rays, UInt32]:
         """Rays of pairs, before they are traced, and the pair of each; see `_packets_of`. The sampler has drawn the
-        numbers of their starts.
+        numbers of their starts. Rays of a group have one time.
         """
         types = jit()
         used = int(packets.sum())
@@ -250,7 +252,7 @@ class PacketTracer(Tracer):
         keys = self._keys_of(key, heads, repeat_of, kinds)
         own_keys = dr.gather(types.Array4u, keys, dr.opaque(types.UInt32, kinds) * pair + half)
         self._sampler.start(tuple(own_keys), within_half, per_half, MOST_SAMPLES // 2)
-        rays = self._rays_of(pixel, window, moments, footprint, aimed)
+        rays = self._rays_of(pixel, window, moments, footprint, aimed, groups)
         # A kernel of its own makes the rays, so that one kernel traces them however they were aimed. It brings the
         # numbers from which the next draws are made as well. Places and shares of the window are evaluated where they
         # are used, from the same numbers.
@@ -287,13 +289,21 @@ class PacketTracer(Tracer):
         return keys
 
     def _rays_of(
-        self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float, aims: LaneAims | LaneEdges | None
+        self,
+        pixel: UInt32,
+        window: UInt32,
+        moments: Moments,
+        footprint: Float,
+        aims: LaneAims | LaneEdges | None,
+        groups: Groups | None,
     ) -> _Rays:
         """One ray per lane."""
         mi, types = self.built.mi, jit()
         row, col = self._row_and_col(pixel)
         sampler = self._sampler
         aperture, moment = sampler.next_3d()
+        if groups is not None:
+            moment = groups.of_first(moment)
         widened = (aperture - 0.5) * footprint + 0.5
         blur = self.rays.blur_numbers(sampler)
         centre = types.Float(col), types.Float(row)

@@ -47,6 +47,16 @@ class PairFlux:
         """Flux of some pairs."""
         return PairFlux(self.half_a[place], self.half_b[place], self.met[place])
 
+    def set_apart(self, part: np.float32, wanted: NDArray[np.float32]) -> None:
+        """Set the halves of pairs whose halves are below a part of the wanted error apart by it; their means stay."""
+        unseen = np.maximum(np.abs(self.half_a), np.abs(self.half_b)) < part * wanted
+        self.half_a[unseen] += wanted[unseen]
+        self.half_b[unseen] -= wanted[unseen]
+
+    def put_at(self, place: NDArray[np.int64], flux: "PairFlux") -> None:
+        """Set the flux of some pairs."""
+        self.half_a[place], self.half_b[place], self.met[place] = flux.half_a, flux.half_b, flux.met
+
     def put(
         self, part: slice | NDArray[np.int64], flux: Float, met: UInt32, packets: NDArray[np.int64], packet_rays: int
     ) -> None:

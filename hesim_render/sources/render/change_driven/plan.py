@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from hesim_render.sources.render.change_driven.aim import Aims
 from hesim_render.sources.render.change_driven.allocation import allocate
-from hesim_render.sources.render.change_driven.differences import Differences, differences
+from hesim_render.sources.render.change_driven.differences import Differences, Shares, differences
 from hesim_render.sources.render.change_driven.edge_courses import fitted_windows
 from hesim_render.sources.render.change_driven.error_target import NoiseUnit
 from hesim_render.sources.render.change_driven.neighbours import Sites
@@ -77,6 +77,7 @@ class Plan:
     pilot : flux of the pilot, e⁻/s.
     aims : small objects at which rays are aimed, by window and site; None if there are none.
     shadows : [window, pixel], known shadows, see `PairTracer.trace`; None if there are none.
+    shared : pairs that share with those around, see `Sharing`; None if none do.
     """
 
     rendered: NDArray[np.bool_]
@@ -92,6 +93,7 @@ class Plan:
     pilot: NDArray[np.float32]
     aims: Aims | None = None
     shadows: NDArray[np.uint32] | None = None
+    shared: NDArray[np.bool_] | None = None
 
     def until(self, window: int) -> "Plan":
         """The plan without the pairs on which no value up to a window depends.
@@ -134,6 +136,7 @@ def plan(
     tuning: Tuning,
     is_knot: bool,
     follows: bool = False,
+    shares: Shares = None,
 ) -> Plan:
     """Plan a block, or a single window, from the pilot pass.
 
@@ -146,6 +149,7 @@ def plan(
     tuning : constants.
     is_knot : True if the first and the last window may be ends of blocks.
     follows : True if edges are followed from window to window.
+    shares : [pixel] each, pixels that share in the anchors of the first and of the last window; None if none do.
 
     Returns
     -------
@@ -201,7 +205,7 @@ def plan(
         part = allocate(pilot, window, sites.only(some), units, quality, gain, tuning, at_end)
         out.rays[window, some], out.controlled[window, some], out.error[window, some], out.floor[window, some] = part
     # where little changes, few rays of a difference do what many rays of the pair alone would
-    chosen = differences(pilot, sites, units, quality, out.rendered, out.rays, tuning)
+    chosen = differences(pilot, sites, units, quality, out.rendered, out.rays, tuning, out.error, shares)
     if follows and last > 1:
         # a fit of a line takes decision rays of its own, which must be few against those of the pair
         worth = out.rendered & (out.rays >= tuning.edge_least_rays) & (chosen.rays == 0) & ~out.barred

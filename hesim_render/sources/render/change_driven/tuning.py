@@ -135,6 +135,11 @@ class Tuning:
     unseen_change : rays, F. From the star alone: scatter of differences that the pilot does not show, as a part of all
         light, times the root of the number of its rays in a neighbourhood. Without (0): pixels at the rim of a penumbra
         are off, above all those without neighbours.
+    least_shared_rays : rays, C. Pairs of an anchor with as many or more try whether sharing pays. Without (1): the
+        trial costs more than it saves.
+    least_sharing_gain : factor, F. Chosen on `room` of `benchmarks/scenes`, judged on the built-in Cornell box: least
+        reduction of the variance for which pixels share, since a shared ray takes about twice as long. Without (1):
+        slower.
     audit_pilot_rays : rays, C. Pilot rays of the audit. Without (as few as `pilot_rays`): the plan of the reference is
         as poor as that of the values it judges.
     least_audit_rays : rays, C. Least number of rays of a reference value. Without: as above.
@@ -197,6 +202,8 @@ class Tuning:
     difference_part: float = 0.5
     difference_factor: float = 0.95
     unseen_change: float = 0.5
+    least_shared_rays: int = 512
+    least_sharing_gain: float = 2.5
     audit_pilot_rays: int = 64
     least_audit_rays: int = 64
     audit_ray_weight: float = 2.0

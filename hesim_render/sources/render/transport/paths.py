@@ -42,10 +42,14 @@ class PathIntegrator:
     max_depth : longest path in segments, 2 is direct light; below 0 there is no limit.
     roulette_depth : first segment with Russian roulette; below 0, never.
     wavelengths : samples the wavelengths of a ray by the filter of its pixel.
+
+    Attributes
+    ----------
+    scene, wavelengths : as given.
     """
 
     def __init__(self, scene: MovingScene, max_depth: int, roulette_depth: int, wavelengths: WavelengthSampler) -> None:
-        self._scene, self._wavelengths = scene, wavelengths
+        self.scene, self.wavelengths = scene, wavelengths
         self._max_depth, self._roulette_depth = (
             depth if depth >= 0 else 1 << 30 for depth in (max_depth, roulette_depth)
         )
@@ -57,19 +61,26 @@ class PathIntegrator:
         dr.make_opaque(self._lamps)
         self._images = LampImages.of(scene.mi, scene.static)
 
+    @property
+    def may_share(self) -> bool:
+        """True if there are second vertices that neighbours may share; the chance of cones depends on the place."""
+        return self._max_depth > 2 and not self._images
+
     def flux(
         self, sampler: MitsubaObject, ray: Ray, moment: Moment, filter_index: UInt32
     ) -> tuple[Float, Float, Float, Mask]:
         """Trace one ray per lane. Parameters and results as `DiffuseIntegrator.flux`, with one estimate in place of
         two.
         """
-        ray.wavelengths = self._scene.mi.UnpolarizedSpectrum(*self._wavelengths.sample(filter_index, sampler.next_1d()))
+        ray.wavelengths = self.scene.mi.UnpolarizedSpectrum(*self.wavelengths.sample(filter_index, sampler.next_1d()))
         radiance, met = self.sample(sampler, ray, moment)
         # not dr.mean: it puts the number of lanes into the kernel, so that each new number would compile again
-        flux = dr.sum(radiance) / len(radiance) * self._wavelengths.total(filter_index)
+        flux = dr.sum(radiance) / len(radiance) * self.wavelengths.total(filter_index)
         return flux, flux, flux, met
 
-    def sample(self, sampler: MitsubaObject, ray: Ray, moment: Moment) -> tuple[Bands, Mask]:
+    def sample(
+        self, sampler: MitsubaObject, ray: Ray, moment: Moment, begun: tuple[Interaction, Mask] | None = None
+    ) -> tuple[Bands, Mask]:
         """Trace one path per lane.
 
         Parameters
@@ -77,30 +88,26 @@ class PathIntegrator:
         sampler : `next_vertex`, see `CounterSampler`.
         ray : Ray3f with wavelengths, world space.
         moment : time of each ray.
+        begun : first vertex of paths whose second segment is `ray`, and the lanes that have one; light that the second
+            vertex itself emits is then left out. None for paths from the camera.
 
         Returns
         -------
         radiance : Spectrum, W m⁻² sr⁻¹ nm⁻¹.
         met : Bool, True where any segment came through the box of a moving object.
         """
-        mi, scene = self._scene.mi, self._scene
-        context = mi.BSDFContext()
-        depth, met = mi.UInt32(0), mi.Bool(False)
+        mi, scene = self.scene.mi, self.scene
+        depth, met = mi.UInt32(0 if begun is None else 1), mi.Bool(False)
         throughput, radiance = mi.Spectrum(1.0), mi.Spectrum(0.0)
         stretch = mi.Float(1.0)  # change of solid angle by refraction
         before = dr.zeros(mi.Interaction3f)
         before_pdf, before_delta = mi.Float(1.0), mi.Bool(True)
         ray, active = mi.Ray3f(ray), mi.Bool(True)
+        if begun is not None:
+            # with a density of 0, sampling of lamps has the whole weight of what the next vertex emits
+            before, active = mi.Interaction3f(begun[0]), mi.Bool(begun[1])
+            before_pdf, before_delta = mi.Float(0.0), mi.Bool(False)
         most, roulette_depth = (dr.opaque(mi.UInt32, depth) for depth in (self._max_depth, self._roulette_depth))
-
-        def shine(si: Interaction, active: Mask, before: Interaction, pdf: Float, delta: Mask) -> Bands:
-            """Light that the hit surface itself emits."""
-            light = si.emitter(scene.static, active)
-            shines = active & (light != None)  # noqa: E711  (a Dr.Jit comparison)
-            seen = mi.DirectionSample3f(scene.static, si, before)
-            light_pdf = scene.static.pdf_emitter_direction(before, seen, shines & ~delta)
-            share = dr.select(delta, 1.0, power_heuristic(pdf, light_pdf))
-            return dr.select(shines, light.eval(si, shines) * share, 0.0)
 
         def step(*state: Any) -> LoopState:
             """One vertex from which the path may continue. The last segment is handled after the loop."""
@@ -108,45 +115,18 @@ class PathIntegrator:
             surface = scene.intersect(ray, moment, depth == 0, active)
             si = surface.rest
             met |= surface.met
-            radiance = dr.fma(throughput, shine(si, active, before, before_pdf, before_delta), radiance)
+            shine = self.shine(si, active, before, before_pdf, before_delta)
+            radiance = dr.fma(throughput, shine, radiance)
 
             goes_on = active & si.is_valid()
-            bsdf = si.bsdf()
             place, lobe, light, luck = sampler.next_vertex()
-
-            # sample a light from this vertex
-            asks = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            seen, weight = scene.static.sample_emitter_direction(surface.world, light, False, asks)
-            asks &= seen.pdf != 0
-            shadow = scene.leaving.to(surface.world, seen.p)
-            infinite = mi.has_flag(seen.emitter.flags(), mi.EmitterFlags.Infinite)
-            # a sky has no distance; Mitsuba gives it one that depends on the size of the resting scene
-            shadow.d = dr.select(infinite, seen.d, shadow.d)
-            shadow.maxt = dr.select(infinite, dr.inf, shadow.maxt)
-            asks &= dr.any(weight != 0)
-            blocked, near = scene.occluded(shadow, moment, asks)
+            lit, chosen, chosen_weight, near = self.scatter(
+                surface, moment, goes_on, depth + 3 <= most, (place, lobe, light)
+            )
             met |= near
-            clear = asks & ~blocked
+            radiance = dr.fma(throughput, lit, radiance)
 
-            towards = surface.to_local(seen.d)
-            choice = lobe
-            if self._images:
-                # a path to the image of a lamp needs two more segments
-                is_diffuse = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & (depth + 3 <= most)
-                upwards = dr.mulsign(mi.Vector3f(surface.shading_normal), mi.Frame3f.cos_theta(si.wi))
-                cones = self._images.seen_from(surface.world.p, upwards, is_diffuse)
-                # where no cone is chosen, rescale the random number for the surface's own sampling
-                lobe = dr.maximum(choice - cones.chance, 0.0) / (1 - cones.chance)
-            value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(context, si, towards, lobe, place, goes_on)
-            if self._images:
-                pdf = dr.fma(1 - cones.chance, pdf, cones.density(seen.d))
-                chosen_weight = _redirected(bsdf, context, surface, cones, choice, place, chosen, chosen_weight)
-            value = si.to_world_mueller(value, -towards, si.wi)
-            share = dr.select(seen.delta, 1.0, power_heuristic(seen.pdf, pdf))
-            radiance = dr.fma(throughput, dr.select(clear, value * weight * share, 0.0), radiance)
-
-            # sample the next direction of the path
-            chosen_weight = si.to_world_mueller(chosen_weight, -chosen.wo, si.wi)
+            # the next direction of the path
             following = scene.leaving.along(surface.world, surface.to_world(chosen.wo))
             ray.o, ray.d, ray.maxt = following.o, following.d, following.maxt
             throughput = dr.select(goes_on, throughput * chosen_weight, throughput)
@@ -167,8 +147,8 @@ class PathIntegrator:
             state = sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray
             return *state, active, left
 
-        left = active & (most <= 1)
-        active &= most > 1
+        left = active & (most <= depth + 1)
+        active &= most > depth + 1
         state = sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active, left
         if self._max_depth == 2:
             end = step(*state)  # a single step needs no loop, which costs time
@@ -190,11 +170,86 @@ class PathIntegrator:
             si.wi, si.wavelengths = -ray.d, ray.wavelengths
         met |= left & near
         # the throughput of a path that has ended is undefined
-        return dr.select(left, dr.fma(throughput, shine(si, left, *before), radiance), radiance), met
+        return dr.select(left, dr.fma(throughput, self.shine(si, left, *before), radiance), radiance), met
+
+    def shine(self, si: Interaction, active: Mask, before: Interaction, pdf: Float, delta: Mask) -> Bands:
+        """Light that a hit surface itself emits, with its weight against sampling of lights.
+
+        Parameters
+        ----------
+        si, active : the surface, and lanes that count.
+        before : vertex before it.
+        pdf, delta : density of the direction that led to it, and True where this was the only one.
+        """
+        mi, static = self.scene.mi, self.scene.static
+        light = si.emitter(static, active)
+        shines = active & (light != None)  # noqa: E711  (a Dr.Jit comparison)
+        seen = mi.DirectionSample3f(static, si, before)
+        light_pdf = static.pdf_emitter_direction(before, seen, shines & ~delta)
+        share = dr.select(delta, 1.0, power_heuristic(pdf, light_pdf))
+        return dr.select(shines, light.eval(si, shines) * share, 0.0)
+
+    def scatter(
+        self,
+        surface: Surface,
+        moment: Moment,
+        goes_on: Mask,
+        may_follow: Mask,
+        numbers: tuple[Point2, Float, Point2],
+    ) -> tuple[Bands, MitsubaObject, Bands, Mask]:
+        """Light of one lamp that a vertex reflects, and the direction in which the path goes on.
+
+        Parameters
+        ----------
+        surface : the vertex.
+        goes_on : lanes with a vertex.
+        may_follow : lanes with two segments or more to go.
+        numbers : random numbers `place`, `lobe` and `light`, see `CounterSampler.next_vertex`.
+
+        Returns
+        -------
+        lit : radiance by light that was sampled.
+        chosen, weight : sample of the direction, and its weight.
+        near : True where the shadow ray came through the box of a moving object.
+        """
+        mi, scene, si = self.scene.mi, self.scene, surface.rest
+        context, bsdf = mi.BSDFContext(), si.bsdf()
+        place, lobe, light = numbers
+
+        # sample a light from this vertex
+        asks = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        seen, weight = scene.static.sample_emitter_direction(surface.world, light, False, asks)
+        asks &= seen.pdf != 0
+        shadow = scene.leaving.to(surface.world, seen.p)
+        infinite = mi.has_flag(seen.emitter.flags(), mi.EmitterFlags.Infinite)
+        # a sky has no distance; Mitsuba gives it one that depends on the size of the resting scene
+        shadow.d = dr.select(infinite, seen.d, shadow.d)
+        shadow.maxt = dr.select(infinite, dr.inf, shadow.maxt)
+        asks &= dr.any(weight != 0)
+        blocked, near = scene.occluded(shadow, moment, asks)
+        clear = asks & ~blocked
+
+        towards = surface.to_local(seen.d)
+        choice = lobe
+        if self._images:
+            # a path to the image of a lamp needs two more segments
+            is_diffuse = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & may_follow
+            upwards = dr.mulsign(mi.Vector3f(surface.shading_normal), mi.Frame3f.cos_theta(si.wi))
+            cones = self._images.seen_from(surface.world.p, upwards, is_diffuse)
+            # where no cone is chosen, rescale the random number for the surface's own sampling
+            lobe = dr.maximum(choice - cones.chance, 0.0) / (1 - cones.chance)
+        value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(context, si, towards, lobe, place, goes_on)
+        if self._images:
+            pdf = dr.fma(1 - cones.chance, pdf, cones.density(seen.d))
+            chosen_weight = _redirected(bsdf, context, surface, cones, choice, place, chosen, chosen_weight)
+        value = si.to_world_mueller(value, -towards, si.wi)
+        share = dr.select(seen.delta, 1.0, power_heuristic(seen.pdf, pdf))
+        chosen_weight = si.to_world_mueller(chosen_weight, -chosen.wo, si.wi)
+        return dr.select(clear, value * weight * share, 0.0), chosen, chosen_weight, near
 
     def _near_lamps(self, ray: Ray) -> Mask:
         """True where a ray meets the box around a light."""
-        inverse, near = inverse_of(ray.d), self._scene.mi.Bool(False)
+        inverse, near = inverse_of(ray.d), self.scene.mi.Bool(False)
         for box in self._lamps:
             near |= meets_box(ray, inverse, dr.inf, box)
         return near
