@@ -22,15 +22,17 @@ from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
 
 CAMERA = """<sensor type="perspective"><float name="fov" value="61"/>
-    <transform name="to_world"><lookat origin="0.1, 0.55, 1.85" target="-0.05, 0.3, 0" up="0, 1, 0"/></transform></sensor>"""
-WALLS = """<shape type="rectangle" id="floor"><transform name="to_world"><rotate x="1" angle="-90"/><scale x="1.4" z="1.4"/>
-      </transform><bsdf type="diffuse"><texture type="checkerboard" name="reflectance">
+    <transform name="to_world"><lookat origin="0.1, 0.55, 1.85" target="-0.05, 0.3, 0" up="0, 1, 0"/></transform>
+    </sensor>"""
+WALLS = """<shape type="rectangle" id="floor">
+      <transform name="to_world"><rotate x="1" angle="-90"/><scale x="1.4" z="1.4"/></transform><bsdf type="diffuse"><texture type="checkerboard" name="reflectance">
       <rgb name="color0" value="0.71, 0.55, 0.4"/><rgb name="color1" value="0.21, 0.3, 0.45"/>
       <transform name="to_uv"><scale x="9" y="9"/></transform></texture></bsdf></shape>
     <shape type="rectangle" id="back"><transform name="to_world"><scale value="1.4"/><translate z="-0.7"/></transform>
       <bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.63, 0.31"/></bsdf></bsdf></shape>
     <shape type="rectangle" id="left"><transform name="to_world"><rotate y="1" angle="90"/><scale value="1.4"/>
-      <translate x="-0.8"/></transform><bsdf type="diffuse"><rgb name="reflectance" value="0.62, 0.2, 0.17"/></bsdf></shape>
+      <translate x="-0.8"/></transform>
+      <bsdf type="diffuse"><rgb name="reflectance" value="0.62, 0.2, 0.17"/></bsdf></shape>
     <shape type="rectangle" id="lamp"><transform name="to_world"><rotate x="1" angle="90"/><scale x="0.3" y="0.2"/>
       <translate x="0.35" y="1.3" z="0.2"/></transform>
       <emitter type="area"><rgb name="radiance" value="9, 7.5, 5"/></emitter></shape>
@@ -40,8 +42,8 @@ THINGS = """<shape type="cube" id="box"><transform name="to_world"><scale value=
       <translate x="-0.35" y="0.17" z="0.1"/></transform>
       <bsdf type="diffuse"><rgb name="reflectance" value="0.3, 0.58, 0.66"/></bsdf></shape>
     <shape type="sphere" id="shiny"><point name="center" x="0.1" y="0.2" z="0.35"/><float name="radius" value="0.2"/>
-      <bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="0.5, 0.4, 0.2"/><float name="alpha" value="0.2"/></bsdf>
-      </shape>
+      <bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="0.5, 0.4, 0.2"/>
+      <float name="alpha" value="0.2"/></bsdf></shape>
     <shape type="sphere" id="glass"><point name="center" x="0.5" y="0.22" z="0.1"/><float name="radius" value="0.22"/>
       <bsdf type="dielectric"/></shape>
     <shape type="sphere" id="bumpy"><point name="center" x="0.3" y="0.75" z="-0.3"/><float name="radius" value="0.25"/>
@@ -112,10 +114,8 @@ def test_tiles_cover_a_lattice():
     assert np.isin(members, pixel).all() and all(np.unique(one).size == SIDE**2 for one in members)
     # of a whole tile all pixels are its own; those at the far edges begin earlier
     assert np.unique(tile).size == 15 and np.count_nonzero(tile == 6) == 16
-    assert (
-        tiles.pixels(np.array([14]))[0].tolist()
-        == lattice.index(*np.indices((4, 4)).reshape(2, -1) + [[7], [14]]).tolist()
-    )
+    row, col = np.indices((4, 4)).reshape(2, -1)
+    np.testing.assert_array_equal(tiles.pixels(np.array([14]))[0], lattice.index(row + 7, col + 14))
 
 
 # ---- no bias ---------------------------------------------------------------------------------------
@@ -241,8 +241,8 @@ def test_runs_have_the_same_values_for_crops_and_splits(scene_of):
         # a mirror, to the image of whose lamp some paths are sent
         (
             "davis346", 6,
-            '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="-90"/><translate x="1.3"/></transform>'
-            '<bsdf type="conductor"/></shape>', False,
+            '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="-90"/><translate x="1.3"/>'
+            '</transform><bsdf type="conductor"/></shape>', False,
         ),
     ],
 )  # fmt: skip
@@ -314,7 +314,7 @@ def test_aimed_pairs_do_not_share(monkeypatch):
     lattice = Lattice(8, 8, (0, 0), (1, 1), 8)
     tracer = SimpleNamespace(
         sensor=SimpleNamespace(spec=SimpleNamespace(evs=True)), rays_done=0, may_share=lambda given: True,
-        trial=lambda tile, given: (np.full((tile.size, 16), 250.0), np.array([40.0, 400.0])[:, None, None] * np.ones((tile.size, 16))),
+        trial=lambda tile, given: (np.full((tile.size, 16), 250.0), np.full((2, tile.size, 16), [[[40.0]], [[400.0]]])),
     )  # fmt: skip
     noise = SimpleNamespace(
         lattice=lambda role: lattice, of=lambda role, index: lambda flux: 0 * flux + np.float32(4.0)
@@ -332,7 +332,7 @@ def test_aimed_pairs_do_not_share(monkeypatch):
 
 
 def test_pairs_are_linked_where_their_differences_have_less_noise():
-    """Six windows of 20 pixels that lie apart: pairs of 256 rays by themselves, or of 64 as differences of little noise."""
+    """Six windows of 20 pixels that lie apart: pairs of 256 rays by themselves, or of 64 as differences."""
     sites, shape = Sites.alone(np.arange(20, dtype=np.uint32)), (6, 20)
     zero = np.zeros(shape, np.float32)
     scatter = zero + np.linspace(30, 600, 20, dtype=np.float32)
