@@ -120,11 +120,11 @@ class PathIntegrator:
 
             goes_on = active & si.is_valid()
             place, lobe, light, luck = sampler.next_vertex()
-            lit, chosen, chosen_weight, near = self.scatter(
+            reflected, chosen, chosen_weight, near = self.scatter(
                 surface, moment, goes_on, depth + 3 <= most, (place, lobe, light)
             )
             met |= near
-            radiance = dr.fma(throughput, lit, radiance)
+            radiance = dr.fma(throughput, reflected, radiance)
 
             # the next direction of the path
             following = scene.leaving.along(surface.world, surface.to_world(chosen.wo))
@@ -208,7 +208,7 @@ class PathIntegrator:
 
         Returns
         -------
-        lit : radiance by light that was sampled.
+        reflected : radiance by light that was sampled.
         chosen, weight : sample of the direction, and its weight.
         near : True where the shadow ray came through the box of a moving object.
         """

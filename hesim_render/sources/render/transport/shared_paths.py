@@ -102,8 +102,8 @@ class SharedPaths:
         first = scene.intersect(ray, moment, True, every)
         goes_on = first.rest.is_valid()
         place, lobe, light, _ = sampler.next_vertex()
-        lit, chosen, weight, near = paths.scatter(first, moment, goes_on, mi.Bool(True), (place, lobe, light))
-        direct = lit + paths.shine(first.rest, every, none, mi.Float(1.0), mi.Bool(True))
+        reflected, chosen, weight, near = paths.scatter(first, moment, goes_on, mi.Bool(True), (place, lobe, light))
+        direct = reflected + paths.shine(first.rest, every, none, mi.Float(1.0), mi.Bool(True))
         goes_on &= dr.any(weight != 0)
         upwards = dr.mulsign(mi.Vector3f(first.shading_normal), mi.Frame3f.cos_theta(first.rest.wi))
         by_cosine = dr.abs(mi.Frame3f.cos_theta(chosen.wo)) * dr.inv_pi
@@ -130,11 +130,11 @@ class SharedPaths:
         gathered, near = self._gathered(
             groups, moment, (begin, upwards, shares), (place, back, is_shared, sent), weight
         )
-        found = dr.select(is_shared, 0.0, sent) + gathered
+        arriving = dr.select(is_shared, 0.0, sent) + gathered
         both = tuple(
             # as for paths of one pixel alone
             dr.sum(dr.fma(weight, bounced, direct)) / len(sent) * paths.wavelengths.total(filter_index)
-            for bounced in (found, sent)
+            for bounced in (arriving, sent)
         )
         return both[0], both[1], met | near
 
