@@ -25,7 +25,8 @@ CAMERA = """<sensor type="perspective"><float name="fov" value="61"/>
     <transform name="to_world"><lookat origin="0.1, 0.55, 1.85" target="-0.05, 0.3, 0" up="0, 1, 0"/></transform>
     </sensor>"""
 WALLS = """<shape type="rectangle" id="floor">
-      <transform name="to_world"><rotate x="1" angle="-90"/><scale x="1.4" z="1.4"/></transform><bsdf type="diffuse"><texture type="checkerboard" name="reflectance">
+      <transform name="to_world"><rotate x="1" angle="-90"/><scale x="1.4" z="1.4"/></transform>
+      <bsdf type="diffuse"><texture type="checkerboard" name="reflectance">
       <rgb name="color0" value="0.71, 0.55, 0.4"/><rgb name="color1" value="0.21, 0.3, 0.45"/>
       <transform name="to_uv"><scale x="9" y="9"/></transform></texture></bsdf></shape>
     <shape type="rectangle" id="back"><transform name="to_world"><scale value="1.4"/><translate z="-0.7"/></transform>
@@ -160,6 +161,33 @@ def test_shared_light_has_no_bias(scene_of, with_things):
     total = np.array([one.sum() for one in shared]), np.array([one.sum() for one in alone])
     assert abs(total[0].mean() - total[1].mean()) < 4 * np.hypot(total[0].std() / 40**0.5, total[1].std() / 8**0.5)
     assert total[0].std() / 40**0.5 < 2e-3 * total[0].mean()
+
+
+def test_no_light_is_shared_through_a_wall(scene_of):
+    """A floor from above, and a sheet that stands on it, edge-on, in the middle of a tile. A lamp on one side shines at
+    a board there, from which light comes to the floor on that side, and little to the other.
+    """
+    camera = CAMERA.replace("0.1, 0.55, 1.85", "0, 0.6, 0").replace("-0.05, 0.3, 0", "0, 0, 0")
+    camera = camera.replace("0, 1, 0", "0, 0, -1")
+
+    def upright(x, height, width):
+        grey = '<bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.55, 0.5"/></bsdf>'
+        place = f'<scale y="{height / 2}" z="{width / 2}"/><translate x="{x}" y="{height / 2}"/>'
+        place = f'<transform name="to_world"><rotate y="1" angle="90"/>{place}</transform>'
+        return f'<shape type="rectangle">{place}<bsdf type="twosided">{grey}</bsdf></shape>'
+
+    turned = '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="-90"/><scale y="0.05" z="0.1"/>'
+    shines = '<emitter type="area"><rgb name="radiance" value="7, 6, 5"/></emitter></shape>'
+    lamp = f'{turned}<translate x="-0.05" y="0.35"/></transform>{shines}'
+    things = upright(0.011, 0.45, 1.1) + upright(-0.6, 0.7, 0.9) + lamp
+    floor = WALLS[: WALLS.index('<shape type="rectangle" id="back">')]
+    source = source_of(scene_of(floor + things, camera=camera))
+    shared, alone = (each.reshape(24, 9, 13) for each in both_of(source, 128, 24))
+    dark, light = ([each[:, :, part].mean(axis=(1, 2)) for each in (shared, alone)] for part in (np.s_[7:], np.s_[:6]))
+    assert dark[1].mean() < 0.5 * light[1].mean()
+    for one, other in (dark, light):
+        spread = np.hypot(one.std(ddof=1), other.std(ddof=1)) / 24**0.5
+        assert abs(one.mean() - other.mean()) < 4 * spread and spread < 0.03 * other.mean()
 
 
 @pytest.mark.parametrize("surface", ["roughplastic", "bumpmap"])
