@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 import hesim_render as hr
+from hesim_render.core.journal import Journal
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.anchor import Anchor
 from hesim_render.sources.render.change_driven.differences import Differences, differences
@@ -219,6 +220,27 @@ def test_a_pixel_has_the_same_bits_whichever_others_are_asked_for(scene_of):
     for name in ("half_a", "half_b", "met"):
         np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[some])
     assert np.all(whole.half_a != whole.half_b)
+
+
+def test_an_interrupted_run_takes_its_tiles_from_the_journal(scene_of, tmp_path):
+    """Two windows and numbers of rays; the second time nothing is traced."""
+    scene = scene_of(WALLS + THINGS.split('<shape type="sphere" id="shiny">')[0], motion=MOTION)
+    windows, values = Windows(np.array([31_000.0, 56_000]), np.array([31_900.0, 57_100])), []
+    for again in (False, True):
+        with pytest.raises(KeyboardInterrupt), Journal(tmp_path / "out", {}, after_s=0.0) as journal:
+            source = source_of(scene)
+            source.go_on(journal, 3)
+            tracer, pixel, lattice = parts_of(source)
+            tracer._block_rays = 9000
+            for window, rays in ((0, 16), (1, 16), (1, 64)):
+                of = pixel, np.full(pixel.size, window), windows, np.full(pixel.size, rays), lattice
+                values.append(tracer.shared(*of))
+            assert (tracer.traces == 0) == again
+            raise KeyboardInterrupt
+    for one, other in zip(values[:3], values[3:], strict=True):
+        for name in ("half_a", "half_b", "met"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert len({one.half_a.tobytes() for one in values}) == 3
 
 
 def test_a_tile_meets_what_any_of_its_paths_meets(scene_of):
