@@ -164,9 +164,11 @@ def test_shared_light_has_no_bias(scene_of, with_things):
     assert total[0].std() / 40**0.5 < 2e-3 * total[0].mean()
 
 
-def test_no_light_is_shared_through_a_wall(scene_of):
+@pytest.mark.parametrize(("turn_deg", "x", "lies"), [(-90, -0.05, False), (90, -0.5, False), (-90, -0.05, True)])
+def test_no_light_is_shared_through_a_wall(scene_of, turn_deg, x, lies):
     """A floor from above, and a sheet that stands on it, edge-on, in the middle of a tile. A lamp on one side shines at
-    a board there, from which light comes to the floor on that side, and little to the other.
+    a board there, or at the sheet, from which light comes to the floor on that side, and little to the other. Or the
+    sheet lies above the floor, and gets no light from what is below it.
     """
     camera = CAMERA.replace("0.1, 0.55, 1.85", "0, 0.6, 0").replace("-0.05, 0.3, 0", "0, 0, 0")
     camera = camera.replace("0, 1, 0", "0, 0, -1")
@@ -177,17 +179,24 @@ def test_no_light_is_shared_through_a_wall(scene_of):
         place = f'<transform name="to_world"><rotate y="1" angle="90"/>{place}</transform>'
         return f'<shape type="rectangle">{place}<bsdf type="twosided">{grey}</bsdf></shape>'
 
-    turned = '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="-90"/><scale y="0.05" z="0.1"/>'
+    turned = f'<transform name="to_world"><rotate y="1" angle="{turn_deg}"/><scale y="0.05" z="0.1"/>'
     shines = '<emitter type="area"><rgb name="radiance" value="7, 6, 5"/></emitter></shape>'
-    lamp = f'{turned}<translate x="-0.05" y="0.35"/></transform>{shines}'
-    things = upright(0.011, 0.45, 1.1) + upright(-0.6, 0.7, 0.9) + lamp
+    height = 0.08 if lies else 0.35
+    lamp = f'<shape type="rectangle">{turned}<translate x="{x}" y="{height}"/></transform>{shines}'
+    sheet = upright(0.011, 0.45, 1.1)
+    if lies:
+        sheet = sheet.replace(
+            '<translate x="0.011" y="0.225"/>', '<rotate z="1" angle="-90"/><translate x="0.236" y="0.2"/>'
+        )
+        assert "rotate z" in sheet
+    things = sheet + upright(-0.6, 0.7, 0.9) + lamp
     floor = WALLS[: WALLS.index('<shape type="rectangle" id="back">')]
-    source = source_of(scene_of(floor + things, camera=camera))
-    shared, alone = (each.reshape(24, 9, 13) for each in both_of(source, 128, 24))
-    dark, light = ([each[:, :, part].mean(axis=(1, 2)) for each in (shared, alone)] for part in (np.s_[7:], np.s_[:6]))
-    assert dark[1].mean() < 0.5 * light[1].mean()
+    source = source_of(scene_of(floor + things, camera=camera), crop=(13, 9, 164, 121))
+    shared, alone = (each.reshape(60, 9, 13) for each in both_of(source, 128, 60))
+    dark, light = ([each[:, :, part].mean(axis=(1, 2)) for each in (shared, alone)] for part in (np.s_[7:], np.s_[4:6]))
+    assert lies or dark[1].mean() < 0.5 * light[1].mean()
     for one, other in (dark, light):
-        spread = np.hypot(one.std(ddof=1), other.std(ddof=1)) / 24**0.5
+        spread = np.hypot(one.std(ddof=1), other.std(ddof=1)) / 60**0.5
         assert abs(one.mean() - other.mean()) < 4 * spread and spread < 0.03 * other.mean()
 
 
@@ -201,6 +210,26 @@ def test_what_is_not_diffuse_keeps_its_own_light(scene_of, surface):
     shared, alone = both_of(source, 32, 1)
     # pixels at the rim see others
     shared, alone = (values.reshape(9, 13)[1:6, 3:10] for values in (shared, alone))
+    assert np.all(alone > 0)
+    np.testing.assert_allclose(shared, alone, rtol=1e-6)
+
+
+def test_light_from_metal_is_not_shared(scene_of):
+    """A floor whose paths meet rough metal or nothing."""
+    floor, sky = (
+        WALLS[: WALLS.index('<shape type="rectangle" id="back">')],
+        WALLS[WALLS.index('<emitter type="constant">') :],
+    )
+    place = '<transform name="to_world"><scale value="3"/><translate z="-0.7"/></transform>'
+    metal = (
+        f'<shape type="rectangle">{place}<bsdf type="roughconductor"><float name="alpha" value="0.3"/></bsdf></shape>'
+    )
+    camera = (
+        CAMERA.replace("0.1, 0.55, 1.85", "0, 0.8, 0")
+        .replace("-0.05, 0.3, 0", "0, 0, 0")
+        .replace("0, 1, 0", "0, 0, -1")
+    )
+    shared, alone = both_of(source_of(scene_of(floor + metal + sky, camera=camera)), 32, 1)
     assert np.all(alone > 0)
     np.testing.assert_allclose(shared, alone, rtol=1e-6)
 
