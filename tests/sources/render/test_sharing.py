@@ -200,6 +200,22 @@ def test_no_light_is_shared_through_a_wall(scene_of, turn_deg, x, lies):
         assert abs(one.mean() - other.mean()) < 4 * spread and spread < 0.03 * other.mean()
 
 
+def test_paths_of_a_group_have_the_same_wavelengths(scene_of):
+    """Floor and wall reflect every other stretch of 12 nm: what both reflect is not the product of their means."""
+    comb = ", ".join(f"{nm}:{0.9 * (k // 2 % 2)}" for k, nm in enumerate(np.arange(360, 830, 6)))
+    grey = f'<bsdf type="diffuse"><spectrum name="reflectance" value="{comb}"/></bsdf>'
+    shapes = [part.split("<bsdf")[0] + grey for part in WALLS.split("</shape>")[:2]]
+    lamp = '<shape type="rectangle"><transform name="to_world"><scale x="0.3" y="0.2"/><translate y="0.6" z="0.1"/>'
+    lamp += (
+        '<rotate y="1" angle="180"/></transform><emitter type="area"><rgb name="radiance" value="9, 9, 9"/></emitter>'
+    )
+    camera = CAMERA.replace("-0.05, 0.3, 0", "-0.05, -0.4, 0.2")
+    source = source_of(scene_of("</shape>".join([*shapes, lamp, ""]), camera=camera))
+    shared, alone = (each.mean(axis=1) for each in both_of(source, 64, 40))
+    spread = np.hypot(shared.std(ddof=1), alone.std(ddof=1)) / 40**0.5
+    assert abs(shared.mean() - alone.mean()) < 4 * spread and spread < 0.01 * alone.mean()
+
+
 @pytest.mark.parametrize("surface", ["roughplastic", "bumpmap"])
 def test_what_is_not_diffuse_keeps_its_own_light(scene_of, surface):
     """A wall before all others, and a floor that bounces light back to it."""
@@ -283,6 +299,20 @@ def test_a_tile_meets_what_any_of_its_paths_meets(scene_of):
     still = source_of(scene_of(WALLS))
     tracer, pixel, lattice = parts_of(still)
     assert not tracer.shared(pixel, 0 * pixel.astype(np.int64), windows, np.full(pixel.size, 8), lattice).met.any()
+
+
+def test_shadow_rays_of_lamps_and_paths_that_end_count_for_a_tile(scene_of):
+    """A floor below the sky, and a small lamp before which a small box moves: few other rays come near it."""
+    camera = CAMERA.replace("0.1, 0.55, 1.85", "0, 0.6, 0").replace("-0.05, 0.3, 0", "0, 0, 0")
+    camera = camera.replace("0, 1, 0", "0, 0, -1")
+    floor = WALLS[: WALLS.index('<shape type="rectangle" id="back">')]
+    lamp = WALLS[WALLS.index('<shape type="rectangle" id="lamp">') :].replace('x="0.3" y="0.2"', 'x="0.004" y="0.003"')
+    box = THINGS.split('<shape type="sphere" id="shiny">')[0].replace('scale value="0.16"', 'scale value="0.02"')
+    box = box.replace('x="-0.35" y="0.17" z="0.1"', 'x="0.35" y="1.26" z="0.2"')
+    motion = MOTION.replace("[0.4, 0.1, 0.07]", "[0.004, 0, 0.002]")
+    tracer, pixel, lattice = parts_of(source_of(scene_of(floor + box + lamp, motion=motion, camera=camera)))
+    windows = Windows(np.array([31_000.0]), np.array([31_900.0]))
+    assert tracer.shared(pixel, 0 * pixel.astype(np.int64), windows, np.full(pixel.size, 8), lattice).met.all()
 
 
 def test_runs_have_the_same_values_for_crops_and_splits(scene_of):
