@@ -17,7 +17,7 @@ from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.neighbours import Lattice, Sites
 from hesim_render.sources.render.change_driven.pilot import Change, Pilot, Refinement
 from hesim_render.sources.render.change_driven.plan import Plan
-from hesim_render.sources.render.change_driven.shared_tracer import SIDE, Tiles
+from hesim_render.sources.render.change_driven.shared_tracer import SIDE, SharedTracer, Tiles
 from hesim_render.sources.render.change_driven.sharing import Sharing
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -358,6 +358,17 @@ def test_runs_have_the_same_values_for_crops_and_splits(scene_of):
 def test_which_sensors_and_scenes_may_share(scene_of, sensor, depth, more, may):
     source = source_of(scene_of(WALLS + more, depth), sensor, (14, 10, 166, 122))
     assert (source._renderer.sharing.lattice is not None) == may
+
+
+def test_pixels_of_several_filters_do_not_share():
+    """A tile of four by six filters, of which every second row and third column is the lattice."""
+    filters = np.arange(24, dtype=np.uint8).reshape(4, 6)
+    filters[1::2, 2::3] = 7
+    tracer = SimpleNamespace(sensor=SimpleNamespace(layout=SimpleNamespace(tile_shape=(4, 6), filter_index=filters)))
+    lattice = Lattice(20, 30, (1, 2), (2, 3), 90)
+    assert SharedTracer._has_one_filter(tracer, lattice)
+    filters[3, 5] = 9
+    assert not SharedTracer._has_one_filter(tracer, lattice)
 
 
 def plan_of(rays):
