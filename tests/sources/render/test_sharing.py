@@ -15,6 +15,7 @@ from hesim_render.sources.render.change_driven.differences import Differences, d
 from hesim_render.sources.render.change_driven.estimates import Band, Counts
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.neighbours import Lattice, Sites
+from hesim_render.sources.render.change_driven.pair_flux import PairFlux
 from hesim_render.sources.render.change_driven.pilot import Change, Pilot, Refinement
 from hesim_render.sources.render.change_driven.plan import Plan
 from hesim_render.sources.render.change_driven.shared_tracer import SIDE, SharedTracer, Tiles
@@ -446,6 +447,51 @@ def test_aimed_pairs_do_not_share(monkeypatch):
     band = Band(np.arange(8), sites, None, False, 16, 0.3, False)
     shared = Sharing(tracer, noise, 0.3, Gain(0.46, 0.56), TUNING).planned(what, band, Counts()).shared[0]
     np.testing.assert_array_equal(shared, ~np.isin(np.arange(8), aimed))
+
+
+def test_pairs_with_known_lines_have_rays_of_their_own():
+    """Of seven pairs, four are to share, one of them holds a line; each result is put where it belongs."""
+    asked = {}
+
+    def shared(pixel, window, windows, rays, lattice, *, span_us):
+        asked["shared"] = pixel.tolist(), window.tolist(), rays.tolist(), span_us
+        return PairFlux(100.0 + pixel, 200.0 + pixel, pixel > 40)
+
+    def trace(pixel, window, windows, rays, controlled, **more):
+        asked["alone"] = pixel.tolist(), window.tolist(), rays.tolist(), controlled.tolist(), more
+        return PairFlux(300.0 + pixel, 400.0 + pixel, pixel > 40)
+
+    sharing = Sharing.__new__(Sharing)
+    sharing.lattice, sharing._tracer = object(), SimpleNamespace(shared=shared, trace=trace)
+    pixel, rays = np.arange(38, 45, dtype=np.uint32), 8 * np.arange(2, 9)
+    lines = np.array([0, 0, 0, 1, 0, 1, 0], np.bool_)
+
+    class Part:
+        def __init__(self, of):
+            self.of, self.is_there = of, lines[of]
+
+        def part(self, place):
+            return Part(self.of[place])
+
+    pairs = pixel, np.arange(7) % 2, "windows", rays, np.arange(7) > 3
+    to_share, shadows = np.array([1, 0, 0, 1, 1, 0, 1], np.bool_), np.arange(7, dtype=np.uint32)
+    every = np.arange(7)
+    flux = sharing.trace(pairs, to_share, (3.0, 5.0), Part(every), Part(every), shadows)
+    alone = [1, 2, 3, 5]
+    assert asked["shared"] == ([38, 42, 44], [0, 0, 0], [16, 48, 64], (3.0, 5.0))
+    assert asked["alone"][:4] == (
+        pixel[alone].tolist(),
+        [1, 0, 1, 1],
+        rays[alone].tolist(),
+        [False, False, False, True],
+    )
+    more = asked["alone"][4]
+    assert more["aims"].of.tolist() == more["edges"].of.tolist() == more["shadows"].tolist() == alone
+    assert more["span_us"] == (3.0, 5.0)
+    is_alone = np.isin(every, alone)
+    np.testing.assert_array_equal(flux.half_a, pixel + np.where(is_alone, 300, 100))
+    np.testing.assert_array_equal(flux.half_b, pixel + np.where(is_alone, 400, 200))
+    np.testing.assert_array_equal(flux.met, pixel > 40)
 
 
 # ---- differences to what has little noise ------------------------------------------------------------
