@@ -387,7 +387,7 @@ def test_pixels_share_where_a_trial_says_so(monkeypatch):
     lattice, tried = Lattice(5, 40, (0, 0), (1, 1), 40), []
     # variance alone over that of shared paths, and the latter, of each of the ten tiles
     gain = np.array([1.0, 2.4, 2.6, 9.0, 9.0, 9.0, 9.0, 2.6, 9.0, 9.0])
-    square = np.array([90.0, 90, 90, 90, 360, 1e6, 0.1, 90, 90, 90])
+    square = np.array([90.0, 90, 90, 90, 360, 1e6, 0.1, 90, 90, 0])  # the last one is dark
 
     class Tracer:
         sensor = SimpleNamespace(spec=SimpleNamespace(evs=True))
@@ -417,7 +417,7 @@ def test_pixels_share_where_a_trial_says_so(monkeypatch):
     what = sharing.planned(plan_of(rays), band, counts)
     assert tried == list(range(11, 20)) and counts.pilot_rays == 9000
     own = np.repeat(np.arange(10), 4)
-    pays = (gain[own] >= TUNING.least_sharing_gain) & (rays >= TUNING.least_shared_rays)
+    pays = (gain[own] >= TUNING.least_sharing_gain) & (rays >= TUNING.least_shared_rays) & (square[own] > 0)
     np.testing.assert_array_equal(what.shared[0], pays)
     # the law of errors from 16 rays on, twice the rays for a knot
     needed = 2 * 16 * (np.sqrt(square[own]) / 1.2) ** (1 / 0.56)

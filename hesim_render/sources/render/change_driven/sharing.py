@@ -106,12 +106,12 @@ class Sharing:
             unit = self._noise.of("events", pixel)(flux.ravel().astype(np.float32)).reshape(flux.shape)
             # rms over the pixels of a tile, in wanted errors
             error = np.sqrt(np.mean(shared / (self._quality * unit) ** 2, axis=1))
-            gain = np.sqrt(alone.sum(axis=1) / np.maximum(shared.sum(axis=1), 1e-30))
-            pays = gain**2 >= tuning.least_sharing_gain
+            pays = alone.sum(axis=1) > tuning.least_sharing_gain * shared.sum(axis=1)
             # anchors are knots
             needed = TRIAL_RAYS * error ** (1 / power) * tuning.knot_factor
             bits = np.rint(np.log2(np.clip(needed, tuning.least_difference_rays, tuning.most_rays)))
             rays = np.where(pays, 2**bits, 0).astype(np.int64)
+            # what this number of rays leaves
             left = error * self._quality * unit.mean(axis=1) * (np.maximum(rays, 1) / TRIAL_RAYS) ** -power
             self._known.update(zip(new.tolist(), zip(rays.tolist(), left.tolist(), strict=True), strict=True))
         known = np.array([self._known[each] for each in tile.tolist()]).reshape(-1, 2)

@@ -127,9 +127,7 @@ class SharedPaths:
         sent = dr.select(arrives, sent, 0.0)
         met |= near
         dr.eval(sent, met)
-        gathered, near = self._gathered(
-            groups, moment, (begin, upwards, shares), (place, back, is_shared, sent), weight
-        )
+        gathered, near = self._gathered(groups, moment, (begin, upwards, shares), (place, back, is_shared, sent))
         arriving = dr.select(is_shared, 0.0, sent) + gathered
         both = tuple(
             # as for paths of one pixel alone
@@ -144,7 +142,6 @@ class SharedPaths:
         moment: Moment,
         firsts: tuple[Interaction, MitsubaObject, Mask],
         seconds: tuple[MitsubaObject, MitsubaObject, Mask, Bands],
-        weight: Bands,
     ) -> tuple[Bands, Mask]:
         """Light from the second vertices of a group at the first vertex of each lane, before it is reflected.
 
@@ -153,7 +150,6 @@ class SharedPaths:
         groups, moment : see `flux`.
         firsts : first vertices, their upward normals, and those that share.
         seconds : second vertices, their normals towards the first one, those that are shared, and the light they send.
-        weight : of the direction that each path took.
 
         Returns
         -------
