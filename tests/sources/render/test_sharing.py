@@ -525,6 +525,34 @@ def test_pairs_are_linked_where_their_differences_have_less_noise():
     np.testing.assert_array_equal(linked.first().linked, expected[:1])
 
 
+def test_what_a_linked_pair_becomes():
+    """Of five rendered pairs in two windows, three are linked, and one of these holds a line."""
+    anchor, todo = Anchor.__new__(Anchor), np.array([[True, True, False], [True, True, True]])
+    linked = np.array([[True, False, True], [True, False, True]])
+    chosen = SimpleNamespace(linked=linked, error=np.array([[3.0, 0, 0], [5, 0, 8]], np.float32))
+    controlled = np.array([[True, False, False], [False, False, True]])
+    what = SimpleNamespace(error=np.arange(20.0, 26).reshape(2, 3), differences=chosen, controlled=controlled)
+    given = []
+
+    def compared(windows, first, pairs, now):
+        given.extend([windows, first, *(values.tolist() for values in pairs), now.half_a.tolist()])
+        return PairFlux(now.half_a + 1, now.half_b + 2, now.met), np.array([4.0, 6.0], np.float32)
+
+    anchor.compared = compared
+    flux = PairFlux(np.arange(5.0), np.arange(5.0), np.zeros(5, np.bool_))
+    edges = SimpleNamespace(is_there=np.array([False, False, True, False, False]))
+    error = anchor.link("windows", "first", what, todo, np.array([8, 16, 32, 64, 128]), edges, flux)
+    # the first pair, and the last one: window 1, pixel 2
+    assert given == ["windows", "first", [0, 1], [0, 2], [8, 128], [True, True], [0.0, 4.0]]
+    np.testing.assert_allclose(error, [5, 21, 23, 24, 10])
+    np.testing.assert_array_equal(flux.half_a, [1, 1, 2, 3, 5])
+    np.testing.assert_array_equal(flux.half_b, [2, 1, 2, 3, 6])
+    given.clear()
+    chosen.linked[:] = False
+    anchor.link("windows", "first", what, todo, np.array([8, 16, 32, 64, 128]), None, flux)
+    assert given == []
+
+
 def test_linked_pairs_have_no_bias_and_the_noise_of_their_differences(scene_of):
     """A whole run with few rays of pairs by themselves, for seven seeds, against paths that share nothing."""
     few = replace(TUNING, most_rays=512, least_shared_rays=32, least_sharing_gain=0.1, difference_gain=1e9)

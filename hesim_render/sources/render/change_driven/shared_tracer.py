@@ -29,6 +29,8 @@ from hesim_render.sources.render.transport.shared_paths import Groups, SharedPat
 SIDE = 4
 #: Rays of a pixel and repetitions of a trial.
 TRIAL_RAYS, _REPEATS = 16, 4
+#: Part of the rays that are traced at a time: each of these has a density for each pixel of its tile.
+_PART = 4
 
 
 @dataclass(frozen=True)
@@ -149,10 +151,10 @@ class SharedTracer(PairTracer):
         lane_window, packets = np.repeat(window, size).astype(np.uint32), np.repeat(rays // PACKET, size)
         out = PairFlux.empty(pixels.size), PairFlux.empty(pixels.size)
         moments, key = self._moments(windows, span_us), self._key(stream)
-        # rays up to the end of each tile; at a time as many tiles as fit, or a single one
+        # rays up to the end of each tile; at a time as many tiles as a part of a block holds, or a single one
         upto, begin = np.cumsum(rays * size), 0
         while begin < tile.size:
-            room = self._block_rays + (upto[begin - 1] if begin else 0)
+            room = self._block_rays // _PART + (upto[begin - 1] if begin else 0)
             end = max(begin + 1, int(np.searchsorted(upto, room, side="right")))
             part = slice(begin * size, end * size)
             lanes = pixels[part], lane_window[part], np.full(pixels[part].size, repeat, np.uint32)

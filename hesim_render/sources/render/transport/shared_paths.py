@@ -157,21 +157,28 @@ class SharedPaths:
         """
         mi, scene = self._paths.scene.mi, self._paths.scene
         (begin, upwards, shares), (place, back, is_shared, sent) = firsts, seconds
-        lane = dr.arange(mi.UInt32, dr.width(sent))
+        types, lane = jit(), dr.arange(mi.UInt32, dr.width(sent))
+        # four numbers side by side, so that one fetch brings them: places, with 1 where they share, and both normals
+        places, normals, ups, lights = (
+            dr.ravel(types.Array4f(*values))
+            for values in ((*begin.p, dr.select(shares, 1.0, 0.0)), (*begin.n, 0.0), (*upwards, 0.0), tuple(sent))
+        )
+        dr.eval(places, normals, ups, lights)
         # [second vertex, first vertex], densities with which first vertices choose the places of second ones, m⁻²
         densities = dr.empty(mi.Float, dr.width(sent) * groups.count)
 
         def meet(number: UInt32, total: Float, met: Mask) -> LoopState:
             """Density of one first vertex of the group at the second vertex of this lane."""
             other = groups.lane(number)
+            there, normal, up = (dr.gather(types.Array4f, values, other) for values in (places, normals, ups))
             one = dr.zeros(mi.Interaction3f)
-            one.p, one.n = dr.gather(mi.Point3f, begin.p, other), dr.gather(mi.Normal3f, begin.n, other)
+            one.p, one.n = mi.Point3f(there[0], there[1], there[2]), mi.Normal3f(normal[0], normal[1], normal[2])
             way = place - one.p
             square = dr.squared_norm(way)
             direction = way * dr.rsqrt(square)
-            leaves = dr.dot(dr.gather(mi.Vector3f, upwards, other), direction)
+            leaves = dr.dot(mi.Vector3f(up[0], up[1], up[2]), direction)
             arrives = -dr.dot(back, direction)
-            asks = is_shared & dr.gather(mi.Bool, shares, other) & (leaves > 0) & (arrives > 0)
+            asks = is_shared & (there[3] > 0) & (leaves > 0) & (arrives > 0)
             # its own first vertex has seen it
             blocked, near = scene.occluded(scene.leaving.to(one, place), moment, asks & (number != groups.own))
             density = dr.select(asks & ~blocked, leaves * arrives / square * dr.inv_pi, 0.0)
@@ -190,7 +197,8 @@ class SharedPaths:
             other = groups.lane(number)
             density = dr.gather(mi.Float, densities, other * groups.size + groups.own)
             share = dr.select(density > 0, density / dr.gather(mi.Float, total, other), 0.0)
-            return number + 1, dr.fma(dr.gather(mi.UnpolarizedSpectrum, sent, other), share, light)
+            bands = dr.gather(types.Array4f, lights, other)
+            return number + 1, dr.fma(mi.UnpolarizedSpectrum(*bands), share, light)
 
         light = dr.while_loop((mi.UInt32(0), mi.UnpolarizedSpectrum(0.0)), goes_on, take, label="shares")[1]
         return light, met
