@@ -1,11 +1,13 @@
 """Pixels that share the second vertices of their paths: no bias, the same bits for any list of pixels, fewer rays."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import stats
 
 import hesim_render as hr
 from hesim_render.core.journal import Journal
@@ -22,6 +24,7 @@ from hesim_render.sources.render.change_driven.shared_tracer import SIDE, Shared
 from hesim_render.sources.render.change_driven.sharing import Sharing
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
+from hesim_render.sources.render.exact import RenderedFlux
 
 CAMERA = """<sensor type="perspective"><float name="fov" value="61"/>
     <transform name="to_world"><lookat origin="0.1, 0.55, 1.85" target="-0.05, 0.3, 0" up="0, 1, 0"/></transform>
@@ -249,6 +252,31 @@ def test_light_from_metal_is_not_shared(scene_of):
     shared, alone = both_of(source_of(scene_of(floor + metal + sky, camera=camera)), 32, 1)
     assert np.all(alone > 0)
     np.testing.assert_allclose(shared, alone, rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["room", "cornell-box"])
+def test_a_closed_room_has_the_flux_of_mitsubas_integrators(name):
+    """Welch's test of 24 parts of 4×4 pixels, each of which cuts tiles, and their sum; eight seeds of either mode."""
+    file = str(Path(__file__).parents[3] / "benchmarks" / "scenes" / "room.yaml")
+    scene, sensor = hr.load_scene(file if name == "room" else name), hr.load_sensor("davis346").crop(24, 16, 150, 118)
+    own, other = [], []
+    for seed in range(8):
+        source = ChangeDrivenFlux(scene, sensor, seed=500 + seed)
+        blocks = list(source.sample_blocks(1, 0, 5000))
+        samples = list(source.flux_of_blocks(source.sensor.layout.evs_pixel.ravel(), blocks))
+        own.append(0.5 * (np.array(samples[-1].half_a, np.float64) + np.array(samples[-1].half_b)))
+        begin_us, end_us = (times[blocks[-1].wanted][-1] for times in (blocks[-1].begin_us, blocks[-1].end_us))
+        exact = RenderedFlux(scene, sensor, 512, 900 + seed, max_motion_px=0.02)
+        halves = exact.mean_flux(source.sensor.layout.evs_pixel.ravel(), begin_us, end_us)
+        other.append(0.5 * (np.array(halves[0], np.float64) + np.array(halves[1])))
+    assert sum(rays > 0 for rays, _ in source._renderer.sharing._known.values()) >= 10
+    parts = [np.array(each).reshape(8, 4, 4, 6, 4).sum(axis=(2, 4)).reshape(8, 24) for each in (own, other)]
+    p = stats.ttest_ind(*parts, equal_var=False).pvalue
+    assert p.min() > 1e-3 / 24 and stats.kstest(p, "uniform").pvalue > 1e-3
+    sums = [each.sum(axis=1) for each in parts]
+    assert stats.ttest_ind(*sums, equal_var=False).pvalue > 1e-3
+    assert max(each.std(ddof=1) / each.mean() for each in sums) / 8**0.5 < 1e-3
 
 
 # ---- purity ----------------------------------------------------------------------------------------
