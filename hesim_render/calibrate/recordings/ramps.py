@@ -42,9 +42,8 @@ _MOST_NOISE = 0.25
 #: Largest V that tells: events of strong noise leave intervals that count no longer, those with the largest D.
 _MOST_VARIANCE = 0.2
 #: Error of ln V, one for all intervals of both polarities, and what unlike noise in bright and dark light adds to it,
-#: over the logarithm of their variances' ratio. Measured on
-#: 18 sensors written in NumPy (33 to 1512 Hz, poles 1 to 7 apart): 0.15 rms, −0.11 in the mean; on one of 27 Hz and
-#: the smallest noise −0.65.
+#: over the logarithm of their variances' ratio. Measured on 18 sensors written in NumPy (33 to 1512 Hz, poles 1 to 7
+#: apart): 0.15 rms, −0.11 in the mean; on one of 27 Hz and the smallest noise −0.65.
 _LAW_ERROR, _OF_LIGHT = 0.15, 0.25
 #: By how much both likelihoods may be below their maxima together; beyond, something else scatters the events.
 _LIKELY = 4.5

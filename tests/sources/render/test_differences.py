@@ -233,14 +233,14 @@ def test_sites_near_a_mark():
     np.testing.assert_array_equal(alone.near(marked, 2), marked)
 
 
-def shadow_scene(**lens):
+def shadow_scene(keys=None, **lens):
     """A plate that turns before a wall in even light: its shadow is one wide penumbra. Without a focal length, the
     region that is read out sees 24°.
     """
     wall = {"name": "wall", "shape": "rectangle", "size_m": [3, 3, 0], "position_m": [0, 0, -0.09], "reflectance": 0.37}
     plate = {"name": "plate", "shape": "rectangle", "size_m": [0.14, 0.05, 0], "position_m": [0.01, 0, 0],
              "reflectance": 0.8, "pattern": 0.25, "pattern_count": [3, 2]}  # fmt: skip
-    keys = [{"t_us": 0, "rotation_deg": 7}, {"t_us": 60_000, "rotation_deg": 95}]
+    keys = keys or [{"t_us": 0, "rotation_deg": 7}, {"t_us": 60_000, "rotation_deg": 95}]
     return make_scene(
         objects=[wall, plate],
         light={"type": "uniform", "illuminant": "D65", "illuminance_lux": 700},

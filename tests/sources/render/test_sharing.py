@@ -410,7 +410,7 @@ def plan_of(rays):
     )
 
 
-def test_pixels_share_where_a_trial_says_so(monkeypatch):
+def test_pixels_share_where_a_trial_says_so():
     """Tiles of a lattice of 5×40 pixels, of which the last row asks; in noise units of 4, and wanted errors of 1.2."""
     lattice, tried = Lattice(5, 40, (0, 0), (1, 1), 40), []
     # variance alone over that of shared paths, and the latter, of each of the ten tiles
@@ -459,7 +459,7 @@ def test_pixels_share_where_a_trial_says_so(monkeypatch):
     assert len(tried) == 9
 
 
-def test_aimed_pairs_do_not_share(monkeypatch):
+def test_aimed_pairs_do_not_share():
     lattice = Lattice(8, 8, (0, 0), (1, 1), 8)
     tracer = SimpleNamespace(
         sensor=SimpleNamespace(spec=SimpleNamespace(evs=True)), rays_done=0, may_share=lambda given: True,

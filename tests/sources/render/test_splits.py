@@ -2,46 +2,24 @@
 
 import numpy as np
 import pytest
-from rendering import make_scene
 from test_change_driven import noisy
+from test_differences import no_outlines, shadow_scene  # noqa: F401  (a fixture of every test here)
 
 import hesim_render as hr
 from hesim_render.mosaic.schedule import tick_blocks
 from hesim_render.sources.render.change_driven.anchor import Anchor
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
-from hesim_render.sources.render.transport import outlines
 
-
-@pytest.fixture(autouse=True)
-def no_outlines(monkeypatch):
-    """Light whose noise differences are made for: nothing is known in closed form of what hides the sky."""
-    monkeypatch.setattr(outlines, "outlines_of", lambda scene: [])
-
-
-def turning_plate():
-    """A plate that turns before a wall in even light, most of whose pixels change slowly."""
-    wall = {"name": "wall", "shape": "rectangle", "size_m": [3, 3, 0], "position_m": [0, 0, -0.09], "reflectance": 0.37}
-    plate = {"name": "plate", "shape": "rectangle", "size_m": [0.14, 0.05, 0], "position_m": [0.01, 0, 0],
-             "reflectance": 0.8, "pattern": 0.25, "pattern_count": [3, 2]}  # fmt: skip
-    return make_scene(
-        objects=[wall, plate],
-        light={"type": "uniform", "illuminant": "D65", "illuminance_lux": 700},
-        camera={"origin_m": [0, 0, 0.6], "target_m": [0, 0, 0], "horizontal_fov_deg": 24},
-        motion=[
-            {
-                "object": "plate",
-                "keyframes": [{"t_us": 0, "rotation_deg": 7}, {"t_us": 120_000, "rotation_deg": 9.5}],
-            }
-        ],
-    )
+#: The plate turns slowly, so that most pixels that change do so by little.
+KEYS = [{"t_us": 0, "rotation_deg": 7}, {"t_us": 120_000, "rotation_deg": 9.5}]
 
 
 def run(sensor, begin_us, end_us):
     """Ends of the windows after one time and up to another, µs, and their flux, half a and half b, [window, 2, pixel];
     of a source that has seen nothing before. Pixels of ticks are differences as well.
     """
-    source = ChangeDrivenFlux(turning_plate(), sensor, 0.2, seed=4)
+    source = ChangeDrivenFlux(shadow_scene(KEYS), sensor, 0.2, seed=4)
     spec = source.sensor.spec.evs
     # the window in which a run of an asynchronous sensor begins belongs to that run alone
     own = 1 if spec.tick_us is None else 0

@@ -124,7 +124,7 @@ class Foresight:
             # what linked pairs are compared with: each pixel once, by each number of rays
             linked = what.differences.linked[todo]
             inner = (window > 0) & (window < windows.size - 1)
-            rays[0] += np.unique(np.stack([place, inner, each])[:, linked & inner], axis=1)[2].sum(dtype=np.int64)
+            rays[0] += np.unique(np.stack([place, each])[:, linked & inner], axis=1)[1].sum(dtype=np.int64)
             rays[1] += each[linked & ~inner].sum(dtype=np.int64)
             traces += self._tracer.traces - started + _PICTURES
             self._pairs.append((band.index[place], begin_us[window], end_us[window], each.astype(np.int64)))
