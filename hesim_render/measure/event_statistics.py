@@ -94,19 +94,21 @@ def event_statistics(stream: EventStream) -> EventStatistics:
     rows, cols = stream.shape
     result: list[tuple[NDArray, ...]] = []
     # blocks of the file are cut at the ends of parts: only what belongs to the next part is held
-    held, last_us = [no_events()], np.full(rows * cols, -1, np.int64)
+    held, last_us, running = [no_events()], np.full(rows * cols, -1, np.int64), np.zeros(rows * cols, np.int64)
     for events in chain(stream, (no_events(),)):
         held.append(events)
         done = begin_us + (len(result) + 1) * part_us
         while len(result) < PARTS and (events.size == 0 or events["t_us"][-1] >= done):
             every = np.concatenate(held)
             inside = np.searchsorted(every["t_us"], done)
-            result.append(_part(every[:inside], begin_us + len(result) * part_us, part_us, last_us, rows, cols))
+            at_us = begin_us + len(result) * part_us
+            result.append(_part(every[:inside], at_us, part_us, last_us, running, rows, cols))
             held = [every[inside:]]
             done += part_us
         if len(result) == PARTS:
             break
     columns = [np.stack(values) for values in zip(*result, strict=True)]
+    columns[5][-1] += _lengths(running[running > 0])  # bursts that the end of the stream cuts
     if columns[0].sum() < _LEAST_EVENTS:
         problem = f"has {columns[0].sum()} events in {(end_us - begin_us) / US_PER_S:.4g} s"
         raise SpecError(f"{problem}; expected {_LEAST_EVENTS} at least", file=stream.source)
@@ -126,9 +128,19 @@ def _active_windows(part_us: int) -> int:
 
 
 def _part(
-    events: NDArray[np.void], begin_us: int, part_us: int, last_us: NDArray[np.int64], rows: int, cols: int
+    events: NDArray[np.void],
+    begin_us: int,
+    part_us: int,
+    last_us: NDArray[np.int64],
+    running: NDArray[np.int64],
+    rows: int,
+    cols: int,
 ) -> tuple[NDArray, ...]:
-    """Sums over a part; `last_us` [pixel], time of the last event of each pixel or −1, goes on."""
+    """Sums over a part.
+
+    What goes on: `last_us` [pixel], time of the last event of each pixel or −1, and `running` [pixel], length of the
+    burst that may go on, or 0.
+    """
     t_us, x, y = events["t_us"] - begin_us, events["x"].astype(np.int64), events["y"].astype(np.int64)
     pixel = y * cols + x
     on = np.count_nonzero(events["polarity"] > 0)
@@ -146,10 +158,18 @@ def _part(
     ends = np.append(first[1:], True)[: own.size]
     last_us[own[ends]] = times[ends]
     ages = np.histogram(begin_us + part_us - last_us[last_us >= 0], INTERVALS_US)[0]
-    # bursts: successive events of a pixel without a long gap, counted by their lengths
-    starts = np.flatnonzero(first | (times - before_us > GAP_US))
-    length = np.diff(np.append(starts, own.size))
-    bursts = np.bincount(np.minimum(length, LONGEST), minlength=LONGEST + 1)
+    # bursts: successive events of a pixel without a long gap. Each counts as a whole in the part that shows its end:
+    # pieces of those cut between two parts would make both vary alike, and draws of parts scatter too little
+    is_new = (before_us < 0) | (times - before_us > GAP_US)
+    starts = np.flatnonzero(first | is_new)
+    length, pixels = np.diff(np.append(starts, own.size)), own[starts]
+    length += np.where(is_new[starts], 0, running[pixels])
+    running[pixels[~is_new[starts]]] = 0
+    may_go_on = (np.append(first[starts][1:], True)[: starts.size]) & (last_us[pixels] + GAP_US >= begin_us + part_us)
+    is_over = (running > 0) & ((count > 0) | (last_us + GAP_US < begin_us + part_us))
+    bursts = _lengths(length[~may_go_on]) + _lengths(running[is_over])
+    running[is_over] = 0
+    running[pixels[may_go_on]] = length[may_go_on]
     # pixels active in a whole window, each once; with each neighbour, the windows in which both are
     whole = t_us // ACTIVE_US < _active_windows(part_us)
     key = np.unique((t_us[whole] // ACTIVE_US) * (rows * cols) + pixel[whole])
@@ -159,3 +179,8 @@ def _part(
         fits = (row + down < rows) & (col + right < cols)
         active.append(int(np.count_nonzero(np.isin(key[fits] + down * cols + right, key, assume_unique=True))))
     return np.array([on, events.size - on]), intervals, ages, series, np.array(active), bursts, count
+
+
+def _lengths(length: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number of bursts of each length, the longest ones together."""
+    return np.bincount(np.minimum(length, LONGEST), minlength=LONGEST + 1)
