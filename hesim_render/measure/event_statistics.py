@@ -160,15 +160,15 @@ def _part(
     ages = np.histogram(begin_us + part_us - last_us[last_us >= 0], INTERVALS_US)[0]
     # bursts: successive events of a pixel without a long gap. Each counts as a whole in the part that shows its end:
     # pieces of those cut between two parts would make both vary alike, and draws of parts scatter too little
-    is_new = (before_us < 0) | (times - before_us > GAP_US)
+    is_new = times - before_us > GAP_US
     starts = np.flatnonzero(first | is_new)
-    length, pixels = np.diff(np.append(starts, own.size)), own[starts]
-    length += np.where(is_new[starts], 0, running[pixels])
-    running[pixels[~is_new[starts]]] = 0
-    may_go_on = (np.append(first[starts][1:], True)[: starts.size]) & (last_us[pixels] + GAP_US >= begin_us + part_us)
-    is_over = (running > 0) & ((count > 0) | (last_us + GAP_US < begin_us + part_us))
-    bursts = _lengths(length[~may_go_on]) + _lengths(running[is_over])
-    running[is_over] = 0
+    length, pixels, is_new = np.diff(np.append(starts, own.size)), own[starts], is_new[starts]
+    length += np.where(is_new, 0, running[pixels])
+    running[pixels[~is_new]] = 0
+    may_go_on = np.append(first[starts[1:]], True)[: starts.size] & (last_us[pixels] + GAP_US >= begin_us + part_us)
+    # those that came into this part and did not go on are over, as a part is longer than a gap
+    bursts = _lengths(length[~may_go_on]) + _lengths(running[running > 0])
+    running[:] = 0
     running[pixels[may_go_on]] = length[may_go_on]
     # pixels active in a whole window, each once; with each neighbour, the windows in which both are
     whole = t_us // ACTIVE_US < _active_windows(part_us)

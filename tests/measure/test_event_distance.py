@@ -162,6 +162,18 @@ def test_statistics_are_those_of_a_loop():
     assert found.polarity.tolist() == [[np.sum(sign[part == k] == s) for s in (1, -1)] for k in range(20)]
 
 
+@pytest.mark.parametrize(("gap_us", "lengths"), ((1000, {1: 2400, 2: 1}), (1001, {1: 2402})))
+def test_a_burst_goes_on_over_the_end_of_a_part_by_the_longest_gap(gap_us, lengths):
+    """Its second event is at the first instant of a part. In other pixels all events are 50 ms apart."""
+    number, pixel = np.divmod(np.arange(2400), 60)
+    t_us = 50_000 * number + 700 * pixel
+    edge_us = -(-(int(t_us[-1]) + 1) // 20) * 7
+    t_us, pixel = np.append(t_us, [edge_us - gap_us, edge_us]), np.append(pixel, [61, 61])
+    found = event_statistics(EventStream.of(made(t_us, pixel, np.ones(t_us.size, int)), SHAPE)).bursts
+    assert {length: int(count) for length, count in enumerate(found.sum(axis=0)) if count} == lengths
+    assert np.flatnonzero(found[:, 2]).tolist() == [7] * (gap_us == 1000)
+
+
 def test_intervals_are_those_of_the_law_however_short_the_recording():
     """Pixels of unlike rates r: a share Σ r exp(-r t) / Σ r of intervals is longer than t, up to half of the time.
 
