@@ -30,6 +30,8 @@ _PER_INCH = 72
 _LEGEND_LINE = 16
 #: Logarithmic axes of a smaller range have numbers between powers of ten.
 _FEW_DECADES, _ONE_DECADE = 100.0, 10.0
+#: Least ratio of the ends of a logarithmic axis; others are drawn from half to twice the middle.
+_LEAST_SPAN = 1.3
 #: What every figure looks like, whatever the user's own ``matplotlibrc`` says. Text stays text, is never read as
 #: mathematics (a name may hold a $), and identifiers follow from the content alone: the same data give the same bytes.
 _SETTINGS: dict[Any, Any] = {
@@ -91,6 +93,9 @@ def logarithmic(axes: "Axes", *which: str) -> None:
         axis = axes.xaxis if name == "x" else axes.yaxis
         axis.set_major_formatter(tick_text)
         low, high = axis.get_view_interval()
+        if high < _LEAST_SPAN * low:  # of equal values, ticks would all have one number
+            low, high = np.sqrt(low * high) / 2, np.sqrt(low * high) * 2
+            (axes.set_xlim if name == "x" else axes.set_ylim)(low, high)
         if high < _FEW_DECADES * low:
             axis.set_minor_locator(LogLocator(subs=(2, 5) if high > _ONE_DECADE * low else (2, 3, 4, 5, 7)))
             axis.set_minor_formatter(tick_text)

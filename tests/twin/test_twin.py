@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import emva_camera
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy.stats import kstest
 from typer.testing import CliRunner
 
@@ -18,6 +19,7 @@ from hesim_render.calibrate.aps.long_series import Long
 from hesim_render.calibrate.aps.pairs import evaluate
 from hesim_render.calibrate.aps.spatial import Temporal
 from hesim_render.cli.commands import app
+from hesim_render.core.drawing import logarithmic
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.recording.pair_set import read_pair_set
 from hesim_render.twin import comparison, figures, make_twin, page
@@ -464,6 +466,20 @@ def test_the_page_counts_the_statistics_that_pass():
     assert ", at exposure 5 s; rms" in page.check_line(checks[0])
     checks[0].place = "photons per pixel"
     assert ", at 5 photons per pixel; rms" in page.check_line(checks[0])
+
+
+def test_a_logarithmic_axis_of_equal_values_has_numbers_that_differ():
+    figure = Figure()
+    axes = figure.subplots()
+    axes.plot([0.3, 1000.0], [1239.4, 1239.6])
+    logarithmic(axes, "x", "y")
+    figure.canvas.draw()
+    low, high = axes.get_ylim()
+    assert (low, high) == pytest.approx((619.8, 2479), rel=1e-3)
+    labels = axes.yaxis.get_ticklabels() + axes.yaxis.get_ticklabels(minor=True)
+    texts = sorted((one.get_position()[1], one.get_text()) for one in labels if low < one.get_position()[1] < high)
+    assert [text for _, text in texts] == ["700", "1000", "2000"]
+    assert axes.get_xlim()[0] < 0.3 and axes.get_xlim()[1] < 3000
 
 
 def test_a_logarithmic_axis_of_a_spectrum_has_numbers_that_can_be_read():
