@@ -39,7 +39,7 @@ class EventStatistics:
     series : [part, window], events of windows of `WINDOW_US`.
     active : [part, 1 + neighbour], active pixels of windows of `ACTIVE_US`, and those with an active neighbour.
     windows : windows of `ACTIVE_US` in a part.
-    bursts : [part, length], bursts of so many events of a pixel.
+    bursts : [part, length], bursts of so many events of a pixel, each in the part that shows its end.
     pixels : [part, pixel], events.
     """
 
@@ -108,11 +108,11 @@ def event_statistics(stream: EventStream) -> EventStatistics:
         if len(result) == PARTS:
             break
     columns = [np.stack(values) for values in zip(*result, strict=True)]
-    columns[5][-1] += _lengths(running[running > 0])  # bursts that the end of the stream cuts
     if columns[0].sum() < _LEAST_EVENTS:
         problem = f"has {columns[0].sum()} events in {(end_us - begin_us) / US_PER_S:.4g} s"
         raise SpecError(f"{problem}; expected {_LEAST_EVENTS} at least", file=stream.source)
     polarity, intervals, ages, series, active, bursts, pixels = columns
+    bursts[-1] += _lengths(running[running > 0])  # those that the end of the stream cuts
     # intervals go on from the part before, and into the next one: of their own bin, a part has half of either
     left = np.diff(ages, axis=0, prepend=0)
     at_risk = np.cumsum((intervals + left)[:, ::-1], axis=1)[:, ::-1] - left / 2
