@@ -432,13 +432,16 @@ def unequal_parts(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("order", (1, -1))
 def test_parts_of_a_process_differ_in_five_of_a_hundred_figures(order):
-    """Of 200 of each figure at most 24, of all 1400 at most 105, where 10 and 70 are expected: 4e-5 each."""
+    """Of 200 of each figure at most 18, of all 1400 at most 105, where 10 and 70 are expected.
+
+    One of six figures is above 18 by chance in 3 of 100 such tests. Bursts that are cut between parts have 24 and 19.
+    """
     counts = dict.fromkeys([figure[0] for figure in event_distance._FIGURES], 0)
     for seed in range(200):
         both = of_equal_time(*unequal_parts(seed)[::order])
         for one in event_distances(*map(event_statistics, both)):
             counts[one.name] += one.differs
-    assert max(counts.values()) <= 24 and sum(counts.values()) <= 105, counts
+    assert max(counts.values()) <= 18 and sum(counts.values()) <= 105, counts
 
 
 def test_of_two_recordings_as_much_time_counts():

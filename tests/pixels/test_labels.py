@@ -225,38 +225,31 @@ def test_each_lost_event_has_its_own_cause_where_there_are_both():
 
 
 @pytest.mark.parametrize(
-    ("noise_dn", "dead_us", "more", "lost"),
+    ("noise_dn", "dead_us", "most"),
     [
         pytest.param(*p, marks=pytest.mark.slow)
-        for p in (
-            (1.0, 1_000, 0.0, 20),
-            (2.0, 1_000, 0.0074, 400),
-            (2.0, 300, -0.0070, 900),
-            (5.0, 1_000, 0.0321, 2500),
-        )
+        for p in ((2.0, 1_000, 0.0), (1.0, 1_000, 0.0), (2.0, 300, 0.01), (5.0, 1_000, 0.03))
     ],
 )
-def test_with_a_dead_time_signal_has_the_rate_of_the_run_without_noise_but_with_dead_time(
-    noise_dn, dead_us, more, lost
-):
+def test_with_a_dead_time_signal_has_the_rate_of_the_run_without_noise_but_with_dead_time(noise_dn, dead_us, most):
     """As above, both polarities together. The run to compare with has the dead time and the pixels' own thresholds.
 
-    Noise of a twentieth, a tenth and a quarter of the threshold. Noise that is in the reference at the release makes
-    pixels fire more often, or less often where the dead time is shorter than the noise lasts: docs/ground-truth.md
-    states by how much. It is the mean of six seeds, which scatter by 0.09 to 0.21 %.
+    Noise of a tenth of the threshold and of a twentieth. Where the dead time is shorter than the noise lasts, or the
+    noise is a quarter of the threshold, noise is in the reference at the release, so that pixels fire more often or
+    less: docs/ground-truth.md states 1 % and 3 %. The thresholds of both polarities have one mean, as above.
     """
     noise = model(True, {**NOISY, "beta4": noise_dn}, evs__threshold_mismatch_rel=0.05,
-                  evs__refractory_period_us=dead_us)  # fmt: skip
+                  evs__refractory_period_us=dead_us, evs__contrast_threshold_off=THETA)  # fmt: skip
     times = 500 * np.arange(1, 451)
-    events, found = run(noise, times, seed=31)  # none of the six
+    events, found = run(noise, times)
     own, _ = run(noise.without(*NOISES), times, labels=False)
     labelled, expected = (
         np.count_nonzero((each["t_us"] > 100_000) & (each["t_us"] <= 200_000))
         for each in (events[found.label <= Label.MISMATCH], own)
     )
     assert expected > 20_000
-    assert labelled / expected - 1 == pytest.approx(more, abs=0.008)
-    assert found.counts()["lost_refractory"] > lost and found.counts()["mismatch"] > 100
+    assert abs(labelled - expected) < max(np.sqrt(expected), most * expected)
+    assert found.counts()["lost_refractory"] > 50 and found.counts()["mismatch"] > 100
 
 
 # ---- nominal and own thresholds --------------------------------------------------------------------------------------
