@@ -7,7 +7,7 @@ import pytest
 
 import hesim_render as hr
 from hesim_render.mosaic.schedule import BlockSample, Exposure, tick_blocks
-from hesim_render.sources.render.change_driven import forecast
+from hesim_render.sources.render.change_driven import forecast, foresight
 from hesim_render.sources.render.change_driven.anchor import anchor_us
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.foresight import Foretold, Speed
@@ -112,14 +112,17 @@ def test_what_never_changes_is_counted_once(tmp_path):
     np.testing.assert_allclose(estimates[0].rays, render["rays"] + render["pilot_rays"], rtol=0.2)
 
 
-def test_the_speed_is_that_of_the_pairs_with_most_rays():
+def test_the_speed_is_that_of_the_pairs_with_most_rays(monkeypatch):
     """Rays of the picture are timed where its rays are, each pair as often as it has rays; nothing of it counts."""
     source = ChangeDrivenFlux(hr.load_scene("rotating-star"), hr.load_sensor("davis346").crop(24, 18, 150, 110), seed=6)
-    tracer, ahead, seen = source._tracer, source.foresight, []
+    tracer, ahead, seen, now_s = source._tracer, source.foresight, [], [7.0]
     trace = tracer.trace
 
     def noted(pixel, window, windows, samples, *rest):
         seen.append((pixel, windows.begin_us[window], samples))
+        # 0.3 s to start, and 20 ns a ray at the run's beginning, 50 ns later; the first pass compiles for 4 s more
+        ray_s = np.where(windows.begin_us[window] > 0, 50e-9, 20e-9)
+        now_s[0] += 0.3 + np.sum(ray_s * samples) + 4.0 * (len(seen) % 3 == 1)
         return trace(pixel, window, windows, samples, *rest)
 
     tracer.trace = noted
@@ -131,16 +134,23 @@ def test_the_speed_is_that_of_the_pairs_with_most_rays():
     assert 4 < foretold.traces == tracer.traces - traces - 1 + 4
     pairs = ahead._pairs[-1]
     assert not seen and 0.5 * foretold.rays[0] * pixel.size < pairs[3].sum() <= foretold.rays[0] * pixel.size
+    monkeypatch.setattr(foresight.time, "perf_counter", lambda: now_s[0])
     speed = ahead.speed()
-    assert 0 < speed.picture_ray_s < 1e-4 and 0 < speed.pilot_ray_s < 1e-4 and 0 < speed.start_s < 5
     assert source.rays_traced == source.counts.rays == 0 and not ahead._pairs
     few, even, busy = seen[2], seen[5], seen[8]
     assert few[0].size == 8 and even[0].size == 24 * 18 and busy[0].size == 8192 and (busy[2] == 64).all()
     most = np.argmax(pairs[3])
     times = np.sum((busy[0] == pairs[0][most]) & (busy[1] == pairs[1][most]))
     assert times == pytest.approx(8192 * pairs[3][most] / pairs[3].sum(), abs=1)
+    # what tracing eight pairs of 64 rays takes is counted as the start
+    start_s, busy_s = 0.3 + 20e-9 * 8 * 64, 0.3 + 64 * np.where(busy[1] > 0, 50e-9, 20e-9).sum()
+    assert speed.start_s == pytest.approx(start_s, rel=1e-9)
+    assert speed.pilot_ray_s == pytest.approx(20e-9 * (432 - 8) / 432, rel=1e-6)
+    assert speed.picture_ray_s == pytest.approx((busy_s - start_s) / (8192 * 64), rel=1e-6)
+    assert speed.picture_ray_s > 2 * speed.pilot_ray_s
     # without any pairs, all rays are those of the whole region
-    assert ahead.speed().picture_ray_s == pytest.approx(ahead.speed().pilot_ray_s, rel=3)
+    whole = ahead.speed()
+    assert whole.picture_ray_s == whole.pilot_ray_s == pytest.approx(speed.pilot_ray_s, rel=1e-6)
 
 
 def test_rays_of_frames_have_less_beside_them():
