@@ -70,7 +70,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "sources.render.audit.compare": ("tests/sources/render/test_audit.py",),
     "sources.render.change_driven.plan": ("tests/sources/render/test_changes.py",),
     "sources.render.change_driven.tuning:Gain": ("tests/sources/render/test_changes.py",),
-    "sources.render.sampling.sampler:third_coordinates": ("tests/sources/render/test_renderer_sampling.py",),
+    "sources.render.sampling.sampler:surface_points": ("tests/sources/render/test_renderer_sampling.py",),
     "sensor.distortion": ("tests/sensor/test_distortion.py", "tests/sources/render/test_projection.py"),
     "sources.render.blur": ("tests/sources/render/test_blur.py",),
     "sources.render.primary_rays:RayFactory": (

@@ -138,7 +138,8 @@ def test_the_command_prints_and_writes_the_response(recording, tmp_path, capsys)
     assert run(*given) == 0
     printed = capsys.readouterr().out
     assert "noise-free electrons" in printed and "CLIPPED" not in printed
-    assert "MTF at 0.25 cycles per pixel: 0." in printed and "edge 5.0" in printed and f"in {out}" in printed
+    assert "MTF at 0.25 cycles per pixel: 0." in printed and f"in {out}" in printed
+    assert float(re.search(r"edge ([\d.]+)° from the vertical", printed)[1]) == pytest.approx(5, abs=0.03)
     table = np.loadtxt(out, delimiter=",", skiprows=1)
     loaded = hr.Recording.load(recording)
     expected = measure_mtf(loaded, region=(10, 0, 100, 96), signal="electrons", filter_name=name)

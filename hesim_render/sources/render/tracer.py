@@ -276,7 +276,7 @@ class PixelTracer(Tracer):
         row, col = self._row_and_col(index)
         sampler = self._sampler
         sampler.setup(key, index, half, sample, self.samples // 2)
-        aperture, moment = sampler.next_3d()
+        aperture, moment = sampler.start_3d()
         blur = self.rays.blur_numbers(sampler)
         choice, single = sampler.next_1d(), None
         place = types.Float(col), types.Float(row)

@@ -40,7 +40,7 @@ def test_white_furnace_with_interreflection_is_1_within_its_error():
     total = source.sensor.responses["clear"].integral()
     mean, error = ((a + b) / 2).mean() / total, stderr_of_mean(a, b) / total
     assert error < 5e-3
-    assert abs(mean - 1) < 4.4 * error  # false alarm 1e-5
+    assert abs(mean - 1) < 4.4 * error + 1e-6  # false alarm 1e-5, and float32
 
 
 def test_flat_field_equals_the_closed_form():

@@ -43,7 +43,7 @@ def plane(bsdf, z=0.0, half=1.0):
 def draws_of_mitsuba(monkeypatch):
     """Random numbers in the order in which Mitsuba's path tracer takes them, and skies sampled as it does."""
 
-    def next_vertex(self):
+    def next_vertex(self, is_first):
         light, lobe, place = self.next_2d(), self.next_1d(), self.next_2d()
         return place, lobe, light, self.next_1d()
 

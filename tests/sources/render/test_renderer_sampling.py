@@ -6,7 +6,13 @@ import pytest
 from scipy import stats
 
 from hesim_render.core.backend import jit
-from hesim_render.sources.render.sampling.sampler import permute, sampler_class, third_coordinates, zero_two_point
+from hesim_render.sources.render.sampling.sampler import (
+    permute,
+    sampler_class,
+    surface_points,
+    third_coordinates,
+    zero_two_point,
+)
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.spectral.spectrum import Spectrum
@@ -57,21 +63,77 @@ def test_points_are_those_of_sobol():
     np.testing.assert_array_equal(third_coordinates(11, 1), third_coordinates(0, 12)[[0, 2048]])
 
 
+def held(points, splits):
+    """Smallest and largest number of points of a half in boxes of 2^-split; points [half, n, axis]."""
+    cell = np.zeros(points.shape[:2])
+    for axis, split in enumerate(splits):
+        cell = cell * 2**split + np.floor(points[..., axis] * 2**split)
+    counts = [np.bincount(each.astype(np.int64), minlength=2 ** sum(splits)) for each in cell]
+    return np.min(counts), np.max(counts)
+
+
+@pytest.mark.parametrize("bits", range(5, 12))
+def test_place_and_direction_fill_all_boxes(bits):
+    """A net of t = 2, or of 3 for 1024 points, in four dimensions; numbers beyond the table keep their order."""
+    types, count, t = jit(), 1 << bits, 3 if bits == 10 else 2
+    numbers = np.arange(count, dtype=np.uint32), surface_points()[:count]
+    np.testing.assert_array_equal(np.sort(numbers[1]), numbers[0])
+    pairs = [np.array(v, dtype=np.float64) / 2**32 for each in numbers for v in zero_two_point(types.UInt32(each))]
+    points = np.stack(pairs, axis=1)[None]
+    total, splits = bits - t, range(bits - t + 1)
+    for i, j, k in ((i, j, k) for i in splits for j in splits for k in splits if i + j + k <= total):
+        assert held(points, [i, j, k, total - i - j - k]) == (1 << t, 1 << t)
+    assert all(held(points[..., 2:], [i, bits - i]) == (1, 1) for i in range(bits + 1))
+
+
 @pytest.mark.parametrize("per_half", [64, 4096])
 def test_place_and_instant_are_stratified_together(per_half):
-    pair, third = started(20, per_half).next_3d()
-    points = np.stack([*np.array(pair), np.array(third)], axis=1).reshape(20, 2, per_half, 3)
+    pair, third = started(20, per_half).start_3d()
+    points = np.stack([*np.array(pair), np.array(third)], axis=1).reshape(40, per_half, 3)
     for axis in range(3):
-        cells = np.sort(np.floor(points[..., axis] * per_half), axis=2)
+        cells = np.sort(np.floor(points[..., axis] * per_half), axis=1)
         np.testing.assert_array_equal(cells, np.broadcast_to(np.arange(per_half), cells.shape))
     # Sobol's first three coordinates are a net of t = 1 (Sobol 1967): any box of volume 2/n holds two points
     bits = per_half.bit_length() - 2
     for i in range(bits + 1):
         for j in range(bits - i + 1):
-            split = 2.0 ** np.array([i, j, bits - i - j])
-            x, y, z = np.moveaxis(np.floor(points * split), -1, 0)
-            cell = np.sort((x * split[1] + y) * split[2] + z, axis=2)
-            np.testing.assert_array_equal(cell, np.broadcast_to(np.arange(per_half) // 2, cell.shape))
+            assert held(points, [i, j, bits - i - j]) == (2, 2)
+
+
+@pytest.mark.parametrize("per_half", [256, 4096])
+def test_lamps_are_stratified_with_the_place(per_half):
+    """Each lamp by itself, with shifts of its own; the wavelength between them is drawn apart."""
+    sampler, bits = started(5, per_half), per_half.bit_length() - 1
+    place, _ = sampler.start_3d()
+    wavelength, lamp, other = sampler.next_1d(), sampler.surface_2d(), sampler.surface_2d()
+    points = np.stack([*np.array(place), *np.array(lamp), *np.array(other), np.array(wavelength)], axis=1)
+    points = points.reshape(10, per_half, 7)
+    for axes in ([0, 1, 2, 3], [0, 1, 4, 5]):
+        # of 4096 points only the first 2048 are ordered together
+        least, most = held(points[..., axes], [2, 1, 1, bits - 6 - (per_half == 4096)])
+        assert least == most or (per_half == 4096 and least >= most / 2)
+        for axis in axes[2:]:
+            cells = np.sort(np.floor(points[..., axis] * per_half), axis=1)
+            np.testing.assert_array_equal(cells, np.broadcast_to(np.arange(per_half), cells.shape))
+    assert held(points[..., [0, 6]], [2, bits - 4])[0] < 4
+    assert not np.array_equal(points[..., 2:4], points[..., 4:6])
+
+
+def test_a_penumbra_costs_fewer_rays_with_the_lamp_among_the_coordinates():
+    """RMS error of the mean of a step in place and the point on a lamp, against the same with the lamp drawn apart."""
+    per_half, pixels = 512, 1000
+    sampler = started(pixels, per_half)
+    place, _ = sampler.start_3d()
+    lamps = sampler.surface_2d(), sampler.next_2d()
+    rng = np.random.default_rng(3)
+    normal = rng.normal(size=(pixels, 1, 1, 4))
+    normal /= np.linalg.norm(normal, axis=3, keepdims=True)
+    edge, errors = rng.uniform(-0.4, 0.4, (pixels, 1, 1)), []
+    for lamp in lamps:
+        points = np.concatenate([np.array(place), np.array(lamp)]).T.reshape(pixels, 2, per_half, 4) - 0.5
+        means = (np.sum(points * normal, axis=3) > edge).mean(axis=2)
+        errors.append(np.sqrt(np.mean((means[:, 0] - means[:, 1]) ** 2)))
+    assert errors[0] < 0.7 * errors[1]
 
 
 def test_a_moving_edge_costs_fewer_rays_with_the_instant_among_the_coordinates():
@@ -81,7 +143,7 @@ def test_a_moving_edge_costs_fewer_rays_with_the_instant_among_the_coordinates()
     """
     per_half, pixels = 128, 2000
     sampler = started(pixels, per_half)
-    (x, y), t = sampler.next_3d()
+    (x, y), t = sampler.start_3d()
     apart = sampler.next_1d()
     rng = np.random.default_rng(3)
     angle, edge = rng.uniform(0, 2 * np.pi, (pixels, 1, 1)), rng.uniform(-1, 1, (pixels, 1, 1))
@@ -101,7 +163,7 @@ def test_draws_of_a_vertex():
     (χ², 16 × 16 cells, false alarm 1e-4 for each of four pairs).
     """
     per_half, pixels = 64, 10_000
-    place, lobe, light, luck = started(pixels, per_half).next_vertex()
+    place, lobe, light, luck = started(pixels, per_half).next_vertex(jit().Bool(False))
     columns = np.stack([*np.array(place), np.array(lobe), *np.array(light), np.array(luck)], axis=1)
     points = columns.reshape(2 * pixels, per_half, 6)
     assert points.min() > 0 and points.max() < 1
@@ -116,6 +178,22 @@ def test_draws_of_a_vertex():
     for one, other in ((0, 3), (1, 4), (0, 2), (3, 5)):
         counts = np.histogram2d(first[:, one], first[:, other], bins=16, range=[[0, 1], [0, 1]])[0]
         assert stats.chisquare(counts.ravel()).pvalue > 1e-4
+
+
+def test_the_first_vertex_is_stratified_with_the_place():
+    """Lanes choose for themselves whether theirs is the first."""
+    per_half, pixels = 256, 10
+    sampler = started(pixels, per_half)
+    (x, y), _ = sampler.start_3d()
+    lane = dr.arange(jit().UInt32, len(x))
+    (u, v), lobe, light, _ = sampler.next_vertex(lane < len(x) // 2)
+    points = np.stack([np.array(each) for each in (x, y, u, v, *light, lobe)], axis=1).reshape(20, per_half, 7)
+    splits = ([1, 2, 2, 1], [0, 2, 1, 3], [2, 0, 3, 1], [2, 1, 1, 2])
+    for axes in ([0, 1, 2, 3], [0, 1, 4, 5]):
+        assert all(held(points[:10][..., axes], split) == (4, 4) for split in splits)
+        assert all(held(points[10:][..., axes], split)[1] > 4 for split in splits)
+    # place and lobe of either are a net of t = 1
+    assert held(points[..., [2, 3, 6]], [2, 2, 3]) == (2, 2)
 
 
 def test_samples_of_a_half_are_stratified_and_uniform():

@@ -314,7 +314,7 @@ def test_pose_depth_and_intrinsics_put_a_corner_where_the_picture_has_it():
     still = scene(camera_moves=False)
     t_us = 10_000.0
     truth = SceneTruth(still, sensor)
-    flux = rendering.traced(rendering.pair_tracer(still, sensor), 512, t_us, t_us)
+    flux = rendering.traced(rendering.pair_tracer(still, sensor), 4096, t_us, t_us)
     light = ((flux.half_a + flux.half_b) / 2).reshape(ROWS, COLS)
     ids = truth.ids(t_us).object
     # rows and columns through the card alone, away from its corners and the ball

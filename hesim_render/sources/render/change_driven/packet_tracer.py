@@ -301,7 +301,7 @@ class PacketTracer(Tracer):
         mi, types = self.built.mi, jit()
         row, col = self._row_and_col(pixel)
         sampler = self._sampler
-        aperture, moment = sampler.next_3d()
+        aperture, moment = sampler.start_3d()
         if groups is not None:
             moment = groups.of_first(moment)
         widened = (aperture - 0.5) * footprint + 0.5

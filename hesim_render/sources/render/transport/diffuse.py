@@ -261,7 +261,7 @@ class _Lamp:
         normal : unit Vector3f, on the visible side.
         sampler : random numbers.
         """
-        drawn, share = self.rectangle.sample(point.p, normal, sampler.next_2d())
+        drawn, share = self.rectangle.sample(point.p, normal, sampler.surface_2d())
         shadow = self._leaving.to(point, drawn)
         return self.rectangle.irradiance(point.p, normal) * self.scale, share * self.scale, shadow
 
@@ -305,5 +305,5 @@ class _Sky:
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
         """See `_Lamp.seen_from`. Directions have a cosine distribution, so r is 1 as well."""
         mi = self._leaving.mi
-        local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+        local = mi.warp.square_to_cosine_hemisphere(sampler.surface_2d())
         return mi.Float(1.0), mi.Float(1.0), self._leaving.along(point, mi.Frame3f(normal).to_world(local))

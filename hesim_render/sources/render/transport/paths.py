@@ -119,7 +119,7 @@ class PathIntegrator:
             radiance = dr.fma(throughput, shine, radiance)
 
             goes_on = active & si.is_valid()
-            place, lobe, light, luck = sampler.next_vertex()
+            place, lobe, light, luck = sampler.next_vertex(depth == 0)
             reflected, chosen, chosen_weight, near = self.scatter(
                 surface, moment, goes_on, depth + 3 <= most, (place, lobe, light)
             )

@@ -101,7 +101,7 @@ class SharedPaths:
         # the first vertex: light that it emits, and that of lamps
         first = scene.intersect(ray, moment, True, every)
         goes_on = first.rest.is_valid()
-        place, lobe, light, _ = sampler.next_vertex()
+        place, lobe, light, _ = sampler.next_vertex(every)
         reflected, chosen, weight, near = paths.scatter(first, moment, goes_on, mi.Bool(True), (place, lobe, light))
         direct = reflected + paths.shine(first.rest, every, none, mi.Float(1.0), mi.Bool(True))
         goes_on &= dr.any(weight != 0)
