@@ -240,7 +240,7 @@ def test_direct_light_alone_is_a_path_of_two_segments_in_the_default_mode():
     reference = reference_flux(scene, sensor, 256, repeats=4, seed=8)
     # 9 means at 4.5 σ: false alarm 6e-5
     assert agrees(default_flux(scene, sensor), reference)
-    assert not agrees(default_flux(mitsuba_scene(shapes, depth=3), sensor, 64), reference)
+    assert not agrees(default_flux(mitsuba_scene(shapes, depth=3), sensor, 2048), reference)
     manifest = hr.simulate(scene, sensor, duration_s=0.002).manifest["settings"]
     assert manifest["mode"] != "exact" and "exact_because" not in manifest
 
