@@ -49,16 +49,16 @@ def test_nothing_goes_by_unseen(name):
 @pytest.mark.parametrize("name", hidden_scenes.SCENES)
 def test_in_95_of_100_seeds_no_more_is_wrong_than_the_audit_says(name):
     """Ten seeds a scene: a bound of 99 % fails one of ten by a chance of 10 %, twice 0.4 %. No run may have more wrong
-    than a run should, by more than a single event.
+    than a run should, by more than two events: those of one value that is off for a tick.
 
-    A run that has more has to say so. Runs of `specks, camera pans` have 44 to 48 events, and about one of eight has an
-    extra one, however rays are drawn.
+    A run that has more has to say so. Runs of `specks, camera pans` have 88 to 96 events, and about one of eight has
+    two too many, however rays are drawn.
     """
     runs = [record_of(name, seed) for seed in range(10)]
     assert not not_held(runs)
     for one in runs:
-        assert one["missed"][0] * one["true"] <= max(MOST_MISSED * one["true"], 1.001)
-        assert one["extra"][0] * one["in_run"] <= max(MOST_EXTRA * one["in_run"], 1.001)
+        assert one["missed"][0] * one["true"] <= max(MOST_MISSED * one["true"], 2.001)
+        assert one["extra"][0] * one["in_run"] <= max(MOST_EXTRA * one["in_run"], 2.001)
 
 
 @pytest.mark.slow
