@@ -12,7 +12,7 @@ from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.sampling.sampler import permute, sampler_class
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 
-#: A plate above a checked floor, below a lamp: penumbrae on checks of a pixel or less.
+#: A plate above a checked floor, below a lamp: penumbrae on checks of two to three pixels.
 PLATE = """<scene version="3.0.0">
   <integrator type="path"><integer name="max_depth" value="{depth}"/></integrator>
   <sensor type="perspective"><float name="fov" value="31"/>
@@ -40,8 +40,10 @@ camera: {origin_m: [0.3, -0.4, 1.9], target_m: [0.05, 0.02, 0], horizontal_fov_d
 
 
 @pytest.mark.parametrize(("depth", "shared"), [(1, False), (2, False), (3, True)])
-def test_penumbrae_on_checks_have_smaller_errors_than_with_draws_apart(tmp_path, monkeypatch, depth, shared):
-    """RMS error of pixels, by eight repetitions of 1024 rays; of paths alone and in tiles."""
+def test_penumbrae_have_smaller_errors_than_with_directions_drawn_apart(tmp_path, monkeypatch, depth, shared):
+    """RMS error of pixels, by eight repetitions of 1024 rays: lamps in closed form, paths, and paths in tiles; and the
+    same mean.
+    """
     (tmp_path / "scene.xml").write_text(PLATE.format(depth=depth))
     head = "schema_version: 1\nname: plate\ndescription: .\n"
     (tmp_path / "scene.yaml").write_text(head + (XML if depth > 1 else OBJECTS))

@@ -13,9 +13,9 @@ The position in the pixel and the instant are one draw, because a moving edge is
 Where an edge passes over a pixel or two within the window, 128 rays of a half have 0.6 times the error that they have
 if the instant is drawn separately (0.37 instead of 0.6 times the error of independent rays).
 
-What happens at the first surface shares the point of the start, in another order: a penumbra is a surface in place and
-point on the lamp, and where a floor is checked, light and colour are multiplied. Changing pixels have 0.65
-(`camera-sweep`) and 0.75 (`floor-ball` of the benchmarks) times the error of 1024 rays drawn apart.
+The first surface that a ray meets takes the point of the start too, in another order: a penumbra is a surface in place
+and point on the lamp, and on a checked floor colour and light are multiplied. Pixels that change have 0.7 times the
+error of 1024 rays whose directions are drawn apart (`camera-sweep`, and `floor-ball` of the benchmarks).
 
 Padding of low-dimensional sequences: [kollig2002]; permutation: [kensler2013]; hash: lowbias32 of [wellons2018].
 """
@@ -32,7 +32,7 @@ from hesim_render.core.device_types import Float, Mask, MitsubaModule, MitsubaOb
 #: Number of index bits that one table of the third generator matrix covers.
 _TABLE_BITS = 11
 #: Order of the points of first surfaces: bit j of the number of a point is the parity of row j and the number of the
-#: start, of which bits from the eleventh on stay. With it, place and direction are a net in four dimensions: the first
+#: start; bits beyond the eleven of the table stay. With it, place and direction are a net in four dimensions: the first
 #: 2^m points fill all boxes of a volume of 2^(t - m), t being 2 for m from 5 to 9 and for 11, and 3 for 10. Either pair
 #: alone is a net of t = 0, as without it. It was searched for bit by bit (the 600 best, 200 columns more of each), by
 #: the t of place and direction together, of three and two of their coordinates, and of all with the instant.
