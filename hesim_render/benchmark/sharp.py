@@ -17,6 +17,7 @@ from hesim_render.capture.run_settings import noise_models
 from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.backend import jit
 from hesim_render.core.hdf5 import COMPRESSION, new_file, read_dataset
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.units import S_PER_US
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.protocol import FluxSource
@@ -98,7 +99,7 @@ def write_sharp(
             image = np.full((2, sensor.rows * sensor.cols), np.nan, np.float32)
             image[0, pixel], image[1, pixel] = 0.5 * (a + b), np.abs(a - b) * 0.5
             electrons = np.nan_to_num(image[0], nan=0.0) * np.float32(exposure_s)
-            raw = clean.sample_dn(types.Float(electrons), aps.exposure_us, seed).numpy()
+            raw = clean.sample_dn(from_host(types.Float, electrons), aps.exposure_us, seed).numpy()
             raw = np.where(sensor.layout.aps_mask, raw.reshape(shape[1:]), 0)
             for name, values in (
                 ("flux_e_per_s", image[0]), ("stderr_e_per_s", image[1]), ("raw_dn", raw.astype(np.uint16)),

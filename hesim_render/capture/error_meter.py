@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.audit.audit import MOST_OFF, TOLERANCE
 
 #: Number of values sampled per picture, and bins per decade of the histogram after its first bin.
@@ -58,7 +59,7 @@ class ErrorMeter:
         if self._where is None or self._where[0][-1] >= count or self._where[0].size < min(_VALUES, count):
             chosen = np.random.default_rng(0).choice(count, min(_VALUES, count), replace=False)
             place = np.sort(chosen)
-            self._where = place, types.UInt32(place.astype(np.uint32))
+            self._where = place, from_host(types.UInt32, place)
         place, index = self._where
         one, other = (np.array(dr.gather(types.Float, half, index), np.float64) for half in (half_a, half_b))
         error = np.abs(one - other) / 2 / noise((one + other) / 2, place)

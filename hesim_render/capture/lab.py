@@ -17,6 +17,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.npz import NpzWriter
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress
@@ -182,7 +183,7 @@ class _Session:
     def write_frames(self, file: Path, exposures_us: Sequence[int], frames: int, light: float) -> None:
         aps, layout = self.bench.aps, self.bench.sensor.layout
         assert aps is not None
-        flux = jit().Float((light * self.bench.frame_flux_e_per_s).astype(np.float32).ravel())
+        flux = from_host(jit().Float, light * self.bench.frame_flux_e_per_s)
         valid = layout.aps_mask
 
         def shoot() -> Iterator[NDArray[np.uint16]]:
@@ -256,7 +257,7 @@ class _Session:
         """Electrons of one event window, flat on the device."""
         assert self.bench.evs is not None
         seconds = self.bench.evs.spec.window_us * S_PER_US
-        return jit().Float((signal_dn / self.bench.event_dn_per_e_per_s * seconds).astype(np.float32).ravel())
+        return from_host(jit().Float, signal_dn / self.bench.event_dn_per_e_per_s * seconds)
 
     def _counts(
         self, levels: Sequence[Float], trials: int, what: str, parts: NDArray | None = None

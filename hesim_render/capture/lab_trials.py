@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.npz import NpzWriter
 from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.pixels.evs.defects import DefectEvents
@@ -165,7 +166,7 @@ class TrialBench:
 
     def _electrons(self, signal_dn: float) -> Float:
         seconds = self.noise.spec.window_us * S_PER_US
-        return jit().Float((signal_dn / self.dn_per_e_per_s * seconds).astype(np.float32).ravel())
+        return from_host(jit().Float, signal_dn / self.dn_per_e_per_s * seconds)
 
     def _trial(
         self, before: Float, after: Float | None, plan: TrialPlan

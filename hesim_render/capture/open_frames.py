@@ -12,6 +12,7 @@ from hesim_render.capture.error_meter import ErrorMeter
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.schedule import Exposure
 from hesim_render.pixels.aps.model import ApsNoise
@@ -118,8 +119,8 @@ class OpenFrames:
         rows = self._row[where]
         half_a, half_b = self._source.mean_flux(self._pixel[where], first[rows], last[rows])
         types = jit()
-        seconds = types.Float(((last - first)[rows] * S_PER_US).astype(np.float32))
-        index = types.UInt32(where.astype(np.uint32))
+        seconds = from_host(types.Float, (last - first)[rows] * S_PER_US)
+        index = from_host(types.UInt32, where)
         for total, half in ((frame.half_a, half_a), (frame.half_b, half_b)):
             # every index occurs once, so this is no race and the sum's order is that of time
             dr.scatter(total, dr.gather(types.Float, total, index) + half * seconds, index)
@@ -132,7 +133,7 @@ class OpenFrames:
         layout = self._sensor.layout
         exposure = frame.exposure
         count = layout.rows * layout.cols
-        index = types.UInt32(self._pixel)
+        index = from_host(types.UInt32, self._pixel)
         noise = self._sensor.aps
         self.errors.add(
             frame.half_a, frame.half_b, lambda signal, _: noise.noise_equivalent_e(signal, exposure.exposure_us)

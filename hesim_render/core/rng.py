@@ -14,6 +14,7 @@ import numpy as np
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
+from hesim_render.core.host_arrays import from_host
 
 _MASK64 = (1 << 64) - 1
 
@@ -97,7 +98,7 @@ def device_normal(seed: int, stream: Stream, index: np.ndarray) -> np.ndarray:
     flat = np.ascontiguousarray(index, dtype=np.uint32).ravel()
     if flat.size == 0:  # Dr.Jit has no loop over nothing
         return np.zeros(index.shape, np.float32)
-    deviates = philox(seed, stream, types.UInt32(flat)).next_float32x4_normal()[0]
+    deviates = philox(seed, stream, from_host(types.UInt32, flat)).next_float32x4_normal()[0]
     return np.array(deviates, dtype=np.float32).reshape(index.shape)
 
 
@@ -112,7 +113,7 @@ def random_words(seed: int, stream: Stream, pixel: np.ndarray, index: np.ndarray
     """Four random words, uint32 [4, n], of each pixel with an index and a draw of its own, uint32 [n] each."""
     types = jit()
     key = dr.opaque(types.UInt64, stream_key(seed, stream))
-    counters = (types.UInt32(np.ascontiguousarray(values, np.uint32)) for values in (pixel, index, draw))
+    counters = (from_host(types.UInt32, values) for values in (pixel, index, draw))
     words = types.Philox4x32(key, *counters).next_uint32x4()
     dr.eval(words)  # by one kernel for any n; one array of all words would need another kernel for each n
     return np.stack([word.numpy() for word in words])

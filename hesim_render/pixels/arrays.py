@@ -13,6 +13,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import DeviceArray, Float, UInt32
 from hesim_render.core.errors import RangeError
+from hesim_render.core.host_arrays import from_host
 
 #: State of an object between two calls, by name: plain values, NumPy arrays, and tuples and states of these.
 SavedState: TypeAlias = dict[str, Any]
@@ -24,7 +25,7 @@ def to_device(value: float | NDArray) -> Float:
     """
     types = jit()
     if np.ndim(value):
-        return types.Float(np.ascontiguousarray(value, dtype=np.float32).ravel())
+        return from_host(types.Float, value)
     return dr.opaque(types.Float, float(value))
 
 
@@ -60,7 +61,7 @@ def _on_device(value: Any) -> Any:
     if isinstance(value, tuple):
         if len(value) == 2 and isinstance(value[1], np.ndarray):
             kind, entries = value
-            return kind(entries)
+            return from_host(kind, entries)
         return tuple(_on_device(entry) for entry in value)
     return value
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.core.yaml_file import yaml_text
 from hesim_render.exchange import EventStream, evt3
@@ -282,7 +283,7 @@ class Instrument:
         return EvsStage(self._noise, self._seed % 2**64)
 
     def _electrons(self, lux: float) -> Float:
-        return jit().Float((lux * self._per_lux).astype(np.float32))
+        return from_host(jit().Float, lux * self._per_lux)
 
     def _save(self, events: NDArray[np.void], name: str) -> str:
         file = self._folder / f"{name}.raw"

@@ -10,7 +10,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.core.tables import table as device_table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.units import S_PER_US
 from hesim_render.sensor.sensor import Sensor, as_sensor
 from hesim_render.spectral.spectrum import (
@@ -165,7 +165,7 @@ def photocurrent(
     if isinstance(spectral_radiance, np.ndarray):
         return _numpy(spectral_radiance, weights, sensor, filter)
     kind = jit().Float64 if isinstance(spectral_radiance, jit().TensorXf64) else jit().Float
-    return _drjit(spectral_radiance, kind(weights.ravel()), sensor, filter)
+    return _drjit(spectral_radiance, from_host(kind, weights), sensor, filter)
 
 
 def _own_widths(bands: NDArray[np.float64], quadrature: Quadrature) -> NDArray[np.float64]:
@@ -197,7 +197,7 @@ def _own_table(responses: Float, widths: NDArray[np.float64]) -> Float:
     kind = type(values)
     place = dr.arange(types.UInt32, count)
     band = place % bands
-    factors = [dr.gather(kind, device_table(kind, row), band) for row in widths]
+    factors = [dr.gather(kind, from_host(kind, row), band) for row in widths]
     # at the ends the factor is 0, so that the neighbour does not matter
     before = dr.gather(kind, values, dr.select(band > 0, place - 1, place))
     after = dr.gather(kind, values, dr.select(band < bands - 1, place + 1, place))
@@ -209,7 +209,7 @@ def _tensor(values: NDArray | Float, is_double: bool) -> Float:
     types = jit()
     kind = types.TensorXf64 if is_double else types.TensorXf
     if isinstance(values, np.ndarray):
-        return kind(np.ascontiguousarray(values, dtype=np.float64 if is_double else np.float32))
+        return kind(from_host(types.Float64 if is_double else types.Float, values), shape=values.shape)
     return values if isinstance(values, kind) else kind(values)
 
 
@@ -231,8 +231,8 @@ def _drjit(radiance: Float, table: Float, sensor: Sensor, filter: str | None) ->
     count = int(np.prod(shape[:-1], dtype=np.int64))
     kind = type(radiance.array)
     if filter is None:
-        offset = types.UInt32(sensor.layout.filter_index.ravel().astype(np.uint32)) * bands
-        vignetting = kind(sensor.relative_illumination.ravel())
+        offset = from_host(types.UInt32, sensor.layout.filter_index) * bands
+        vignetting = from_host(kind, sensor.relative_illumination)
     else:
         offset, vignetting = dr.zeros(types.UInt32, count), kind(1.0)
     source = radiance.array

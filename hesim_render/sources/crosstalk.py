@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Halves, UInt32
+from hesim_render.core.host_arrays import from_host
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.protocol import FluxSource, Sample
 
@@ -72,7 +73,7 @@ class CrosstalkFlux:
             asked, number = np.divmod(asked, intervals.size)
             begin, end = intervals.real[number], intervals.imag[number]
         halves = self._flux.mean_flux(asked.astype(np.uint32), begin, end)
-        return self._mix(halves, [types.UInt32(where.astype(np.uint32)) for where in place.reshape(sites.shape)])
+        return self._mix(halves, [from_host(types.UInt32, where) for where in place.reshape(sites.shape)])
 
     def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
         """See `FluxSource.sample_blocks`."""
@@ -83,7 +84,7 @@ class CrosstalkFlux:
         types = jit()
         sites = self._sites(np.asarray(pixel, dtype=np.int64).ravel())
         asked, place = np.unique(sites, return_inverse=True)
-        index = [types.UInt32(where.astype(np.uint32)) for where in place.reshape(sites.shape)]
+        index = [from_host(types.UInt32, where) for where in place.reshape(sites.shape)]
         for sample in self._flux.flux_of_blocks(asked.astype(np.uint32), blocks):
             yield Sample(*self._mix((sample.half_a, sample.half_b), index))
 

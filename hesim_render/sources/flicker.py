@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Halves
+from hesim_render.core.host_arrays import from_host
 from hesim_render.mosaic.schedule import CELL_US, Block, blocks_of_run
 from hesim_render.sources.protocol import AuditableFlux, FluxSource, Sample, WeightedFlux
 from hesim_render.sources.still import Kept
@@ -129,7 +130,7 @@ class FlickerFlux:
         halves = [self.sources[number].mean_flux(pixel, begin, end) for number in powered]
         if not powered:
             types = jit()
-            return types.Float(np.zeros(pixel.size, np.float32)), types.Float(np.zeros(pixel.size, np.float32))
+            return dr.zeros(types.Float, pixel.size), dr.zeros(types.Float, pixel.size)
         return _weighted(halves, [weights[number] for number in powered])
 
     def _pieces(self, pixel: NDArray[np.uint32], begin: NDArray, end: NDArray, bounds: NDArray[np.float64]) -> Halves:
@@ -137,7 +138,7 @@ class FlickerFlux:
         types = jit()
         begin, end = (np.broadcast_to(times, pixel.shape) for times in (begin, end))
         length = end - begin
-        totals = [types.Float(np.zeros(pixel.size, np.float32)) for _ in range(2)]
+        totals = [from_host(types.Float, np.zeros(pixel.size, np.float32)) for _ in range(2)]
         for number, (low, high) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
             first, last = np.clip(begin, low, high), np.clip(end, low, high)
             # an empty interval belongs to the piece that begins there; at the very end, to the last piece
@@ -147,7 +148,7 @@ class FlickerFlux:
             if where.size == 0:
                 continue
             weights = [weight * share[where] for weight in self._weights(first[where], last[where])]
-            index = types.UInt32(where.astype(np.uint32))
+            index = from_host(types.UInt32, where)
             for total, half in zip(totals, self._piece(pixel[where], first[where], last[where], weights), strict=True):
                 # every index occurs once, so this is no race and the sum's order is that of time
                 dr.scatter(total, dr.gather(types.Float, total, index) + half, index)
@@ -291,10 +292,7 @@ def _weighted(halves: Sequence[Halves], weights: Sequence[ArrayLike]) -> Halves:
     types = jit()
     # opaque: a literal number would make a new kernel at every time
     factors = [
-        dr.opaque(types.Float, float(np.asarray(w)))
-        if np.ndim(w) == 0
-        else types.Float(np.asarray(w, dtype=np.float32))
-        for w in weights
+        dr.opaque(types.Float, float(np.asarray(w))) if np.ndim(w) == 0 else from_host(types.Float, w) for w in weights
     ]
     total_a, total_b = (
         sum((pair[k] * factor for pair, factor in zip(halves, factors, strict=True)), types.Float(0.0)) for k in (0, 1)

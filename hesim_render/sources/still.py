@@ -15,6 +15,7 @@ from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Halves
 from hesim_render.core.distinct import distinct_pixels
 from hesim_render.core.errors import RangeError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.protocol import FluxSource, Sample
 
@@ -102,13 +103,13 @@ class Kept:
         if not self._known[pixel].all():
             # a static source shows the same at all times, so any interval will do
             fresh = distinct_pixels(pixel[~self._known[pixel]])
-            where = types.UInt32(fresh)
+            where = from_host(types.UInt32, fresh)
             for source, kept in zip(self._sources, self._kept, strict=True):
                 for whole, half in zip(kept, source.mean_flux(fresh, 0.0, 1.0), strict=True):
                     dr.scatter(whole, half, where)
                 dr.eval(kept)
             self._known[fresh] = True
-        index = types.UInt32(pixel)
+        index = from_host(types.UInt32, pixel)
         result = [(dr.gather(types.Float, a, index), dr.gather(types.Float, b, index)) for a, b in self._kept]
         dr.eval(result)
         return result
@@ -121,7 +122,7 @@ class Kept:
         types = jit()
         self._known = np.concatenate([self._known, np.zeros(missing, dtype=np.bool_)])
         for kept in self._kept:
-            room = [types.Float(np.zeros(missing, np.float32)) for _ in range(2)]
+            room = [from_host(types.Float, np.zeros(missing, np.float32)) for _ in range(2)]
             kept[:] = [dr.concat([*old]) for old in zip(kept, room, strict=True)] if kept else room
 
 

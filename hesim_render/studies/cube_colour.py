@@ -11,7 +11,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import device_namespace
 from hesim_render.core.errors import SpecError
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.cube.planes import blocks, integration_weights
 from hesim_render.sources.render.cube import render_cube
 from hesim_render.sources.scene import load_scene
@@ -118,7 +118,7 @@ def cube_figures(
 
 def _lab_on_device(ratios: NDArray[np.float32]) -> Triple:
     """CIELAB of X, Y and Z over white, [3, texel], as device arrays."""
-    x, y, z = (table(jit().Float, row) for row in ratios)
+    x, y, z = (from_host(jit().Float, row) for row in ratios)
     result = lab_of((x, y, z), device_namespace())
     dr.eval(*result)
     return result
@@ -127,7 +127,7 @@ def _lab_on_device(ratios: NDArray[np.float32]) -> Triple:
 def _differences(true: Triple, ratios: NDArray[np.float32]) -> NDArray[np.float32]:
     """ΔE2000 of texels, [texel]."""
     xp = device_namespace()
-    x, y, z = (table(jit().Float, row) for row in ratios)
+    x, y, z = (from_host(jit().Float, row) for row in ratios)
     return np.asarray(delta_e_2000_of(lab_of((x, y, z), xp), true, xp).numpy())
 
 

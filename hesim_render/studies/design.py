@@ -11,7 +11,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float64
 from hesim_render.core.errors import SpecError, did_you_mean
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.sensor import load_sensor
 from hesim_render.specs.design import DesignSpec
@@ -168,24 +168,26 @@ class Problem:
 
     def _light(self, parameters: Float64) -> Float64:
         """Response at the bands of a pixel without a filter, with the depth of the silicon."""
-        light = table(jit().Float64, self.open_response)
+        light = from_host(jit().Float64, self.open_response)
         if self.spec.silicon_depth_um is None:
             return light
         thin_um = 0.01
         per_um = -np.log1p(-silicon_quantum_efficiency(thin_um).at(BANDS_NM)) / thin_um
         before = -np.expm1(-per_um * self._start_depth_um)
-        absorbed = 1 - dr.exp(-table(jit().Float64, per_um) * self.depth_um(parameters))
-        return light * absorbed / table(jit().Float64, before)
+        absorbed = 1 - dr.exp(-from_host(jit().Float64, per_um) * self.depth_um(parameters))
+        return light * absorbed / from_host(jit().Float64, before)
 
     def __call__(self, parameters: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """Cost and gradient with respect to parameters between 0 and 1: filters, depth of the silicon, tile shares."""
         types = jit()
-        given = table(types.Float64, parameters)
+        given = from_host(types.Float64, parameters)
         dr.enable_grad(given)
         filters = self.transmittances(given)
         light = self._light(given)
         responses = [
-            filters[name] * light if name in filters else table(types.Float64, self.start_transmittance[name]) * light
+            filters[name] * light
+            if name in filters
+            else from_host(types.Float64, self.start_transmittance[name]) * light
             for name in self.names
         ]
         counts = None
@@ -255,7 +257,7 @@ def optimise(problem: Problem, progress: Callable[[float, float, str], None] | N
         if best is None or optimum.fun < best.fun:
             best = optimum
     assert best is not None
-    given = jit().Float64(np.ascontiguousarray(best.x))
+    given = from_host(jit().Float64, best.x)
     curves = problem.transmittances(given)
     filters = {name: np.clip(np.array(each, dtype=np.float64), 0.0, 1.0) for name, each in curves.items()}
     shares = depth_um = None

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float64
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sensor.photocurrent import photocurrent
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.specs.design import CostSpec
@@ -131,7 +131,7 @@ class DesignCost:
         types = jit()
         total: Float64 = types.Float64(0.0)
         for condition in self.conditions:
-            radiance = types.TensorXf64(table(types.Float64, condition.radiance), shape=condition.radiance.shape)
+            radiance = types.TensorXf64(from_host(types.Float64, condition.radiance), shape=condition.radiance.shape)
             per_lux: list[Float64] = []
             for response in responses:
                 own = types.TensorXf64(response, shape=(self.wavelength_nm.size,))
@@ -180,8 +180,8 @@ class DesignCost:
         spread = np.full_like(host, _LEAST_VARIANCE) if counts is None else noise.variance_e2(host)
         # the matrix has no derivative of its own: at its best the cost does not change with it
         matrix = best_matrix(host, spread, condition.xyz, condition.weights)
-        rows = [table(types.Float64, condition.weights[:, i, j]) for i in range(3) for j in range(3)]
-        true = [table(types.Float64, column) for column in condition.xyz.T]
+        rows = [from_host(types.Float64, condition.weights[:, i, j]) for i in range(3) for j in range(3)]
+        true = [from_host(types.Float64, column) for column in condition.xyz.T]
         # deviation of XYZ of each surface, with derivatives by the electrons
         off = [
             sum(
@@ -196,7 +196,7 @@ class DesignCost:
         # noise of channel c moves the colour by W M_c: its variance times the square of that length
         weighted = np.einsum("sij,jc->sic", condition.weights, matrix)
         for c, each in enumerate(electrons):
-            gain = table(types.Float64, np.sum(weighted[:, :, c] ** 2, axis=1))
+            gain = from_host(types.Float64, np.sum(weighted[:, :, c] ** 2, axis=1))
             if counts is not None:
                 # plain numbers: NumPy's would turn the array into one of NumPy's, without derivatives
                 constant, linear, square = (float(part[c]) for part in (noise.constant, noise.linear, noise.quadratic))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float64
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 
 #: Bounds of the bands of a dye: centre and full width at half maximum in nm, density.
 _CENTRE_NM, _WIDTH_NM, _DENSITY = (350.0, 750.0), (40.0, 260.0), (0.0, 3.0)
@@ -51,7 +51,7 @@ class Dyes:
 
     def transmittance(self, parameters: list[Float64]) -> Float64:
         """See `Family.transmittance`."""
-        grid = table(jit().Float64, self.wavelength_nm)
+        grid = from_host(jit().Float64, self.wavelength_nm)
         absorbance = dr.zeros(jit().Float64, self.wavelength_nm.size)
         for k in range(self.bands):
             centre, width, density = parameters[3 * k : 3 * k + 3]
@@ -99,7 +99,7 @@ class ThinFilms:
 
     def transmittance(self, parameters: list[Float64]) -> Float64:
         """See `Family.transmittance`."""
-        grid = table(jit().Float64, self.wavelength_nm)
+        grid = from_host(jit().Float64, self.wavelength_nm)
         # B = b_re + i b_im, C = c_re + i c_im, from the substrate to the light
         b_re, b_im, c_re, c_im = (
             dr.ones(jit().Float64, self.wavelength_nm.size),
@@ -160,7 +160,7 @@ class FreeCurves:
         share = (self.wavelength_nm - knots[place]) / (knots[place + 1] - knots[place])
         values = dr.concat(parameters)
         types = jit()
-        low, part = table(types.UInt32, place.astype(np.uint32)), table(types.Float64, share)
+        low, part = from_host(types.UInt32, place), from_host(types.Float64, share)
         return dr.gather(types.Float64, values, low) * (1 - part) + dr.gather(types.Float64, values, low + 1) * part
 
     def start(self, wanted: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibratio
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import WholeFile
+from hesim_render.core.host_arrays import from_host
 from hesim_render.pixels.evs.stage import EvsStage
 
 ROOT = Path(__file__).parents[2]
@@ -56,7 +57,7 @@ def drawn(sensor):
     """A frame, and events of three samples."""
     frame = sensor.aps.sample(np.full(sensor.layout.shape, 100.0), 10_000, seed=1)
     stage = EvsStage(sensor.evs, seed=2)
-    light = [jit().Float(np.full(SHAPE[0] * SHAPE[1], value, np.float32)) for value in (50.0, 62.0, 50.0)]
+    light = [from_host(jit().Float, np.full(SHAPE[0] * SHAPE[1], value, np.float32)) for value in (50.0, 62.0, 50.0)]
     tick_us = sensor.spec.evs.tick_us
     events = np.concatenate([stage.step(values, (k + 1) * tick_us) for k, values in enumerate(light)])
     return frame.tobytes(), events.tobytes()

@@ -13,6 +13,7 @@ from hesim_render.calibration.rates import EventDefectsPerTrial, TelegraphPerFra
 from hesim_render.calibration.spec import Defect
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.pixels.evs.events import Origin
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.capture_set import read_captures
@@ -97,7 +98,7 @@ def test_events_of_leak_come_as_often_at_any_tick(captured):
                 counted += int(np.sum(origin == Origin.LEAK))
 
         stage = EvsStage(sensor.evs.without("shot", "dark_current"), 5, labels=Count())
-        light = jit().Float(np.full(ROWS * COLS, 300.0, np.float32))
+        light = from_host(jit().Float, np.full(ROWS * COLS, 300.0, np.float32))
         for t_us in range(0, 8_000_001, sensor.spec.evs.tick_us):
             stage.step(light, t_us)
         assert counted == pytest.approx(expected, abs=5 * expected**0.5)

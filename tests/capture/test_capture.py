@@ -8,6 +8,7 @@ from hesim_render.capture.loop import Capture
 from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.mosaic.schedule import exposures, tick_blocks
 from hesim_render.sources.still import WindowByWindow
 
@@ -33,7 +34,7 @@ class RampFlux(WindowByWindow):
         middle = 0.5 * (np.asarray(begin_us, dtype=float) + np.asarray(end_us, dtype=float)) * 1e-6
         flux = (1.0 + pixel % self.cols) * (self.base + self.slope * middle)
         types = jit()
-        return types.Float(flux * (1 + self.split)), types.Float(flux * (1 - self.split))
+        return from_host(types.Float, flux * (1 + self.split)), from_host(types.Float, flux * (1 - self.split))
 
 
 def run(flux, sensor, duration_us, clean=True, seed=1):

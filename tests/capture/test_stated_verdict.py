@@ -8,6 +8,7 @@ from hesim_render.capture.lab_trials import TrialPlan
 from hesim_render.capture.scene_run import require_short
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import TooLongError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.renderer import Estimate
 
 
@@ -17,7 +18,9 @@ def meter(scatter, outliers=0.0, count=20_000, seed=3):
     error = rng.normal(size=count) * scatter * np.where(rng.random(count) < outliers, 10, 1)
     level, noise = 300.0, 7.0
     found.add(
-        types.Float(level + error * noise), types.Float(level - error * noise), lambda e, _: np.full(e.size, noise)
+        from_host(types.Float, level + error * noise),
+        from_host(types.Float, level - error * noise),
+        lambda e, _: np.full(e.size, noise),
     )
     return found
 
@@ -26,7 +29,8 @@ def test_an_error_is_in_units_of_the_noise_at_the_mean_of_both_halves():
     """Half of their difference: 4 at a level of 16, whose noise is 8."""
     found = ErrorMeter()
     found.add(
-        *(jit().Float(np.full(50, half, np.float32)) for half in (12.0, 20.0)), lambda level, _: 2 * np.sqrt(level)
+        *(from_host(jit().Float, np.full(50, half, np.float32)) for half in (12.0, 20.0)),
+        lambda level, _: 2 * np.sqrt(level),
     )
     assert found.as_dict()["rms"] == pytest.approx(0.5)
 
@@ -42,7 +46,7 @@ def test_each_value_counts_once_and_in_large_pictures_a_fixed_part_of_them():
     halves = np.array([[103.0, 94.0, 85.0], [97.0, 106.0, 115.0]], np.float32)
     found.add(*map(jit().Float, halves), noise)
     assert found.values == 3 and found.as_dict()["rms"] == pytest.approx(np.sqrt((1 + 4 + 25) / 3), rel=1e-6)
-    large = [jit().Float(np.full(40_000, value, np.float32)) for value in (7.0, 9.0)]
+    large = [from_host(jit().Float, np.full(40_000, value, np.float32)) for value in (7.0, 9.0)]
     found.add(*large, noise)
     found.add(*large, noise)
     assert found.values == 3 + 2 * 32_768 and np.array_equal(places[1], places[2])
@@ -54,7 +58,7 @@ def test_each_value_counts_once_and_in_large_pictures_a_fixed_part_of_them():
 def test_event_truth_is_the_mean_of_both_halves_and_half_of_their_difference():
     flux = EventFlux(2)
     for a, b in (([3.0, 8.0], [5.0, 7.0]), ([4.0, 2.0], [9.0, 3.0]), ([2.0, 5.0], [1.0, 11.0])):
-        flux.add(*(jit().Float(np.array(half, np.float32)) for half in (a, b)))
+        flux.add(*(from_host(jit().Float, half) for half in (a, b)))
     assert flux.mean_e_per_s() == pytest.approx([4, 6]) and flux.stderr_e_per_s() == pytest.approx([1, 1])
 
 

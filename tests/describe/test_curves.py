@@ -11,6 +11,7 @@ import hesim_render as hr
 from hesim_render.core import drawing
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.describe import curve_picture, curves, event_curves, figures_of, photon_transfer, s_curve, table_lines
 from hesim_render.describe.table import TABLE_LUX
 from hesim_render.pixels.evs.noise_rates import events_per_period
@@ -49,7 +50,7 @@ def electrons(sensor, lux):
     light = sheet.light.load() if sheet else illuminant("D65")
     flux = electrons_per_s_lux(sensor.spec, next(iter(sensor.spec.filters)), light)
     window_s = sensor.spec.evs.window_us * 1e-6
-    return jit().Float(np.full(math.prod(sensor.layout.evs_shape), lux * flux * window_s, np.float32))
+    return from_host(jit().Float, np.full(math.prod(sensor.layout.evs_shape), lux * flux * window_s, np.float32))
 
 
 def simulated_rates(sensor, lux, begin_s, seconds, seed=3):

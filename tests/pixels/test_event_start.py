@@ -8,6 +8,7 @@ from scipy import stats
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.shipped import list_names
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import start
@@ -37,7 +38,7 @@ def pixels(**overrides):
 def counts(noise, until_us, seed=5, electrons=0.0, **keys):
     """Events of each pixel in successive spans of still light, [span, pixel]."""
     size = int(np.prod(noise.layout.evs_shape))
-    light, stage = jit().Float(np.full(size, electrons, np.float32)), EvsStage(noise, seed, **keys)
+    light, stage = from_host(jit().Float, np.full(size, electrons, np.float32)), EvsStage(noise, seed, **keys)
     stage.step(light, 12_345)
     found = []
     for t_us in until_us:
@@ -71,7 +72,7 @@ def test_comparisons_of_successive_samples_have_no_beginning():
         {"geometry.rows": SIDE, "geometry.cols": SIDE, "evs.coefficients": [NOISY], "evs.contrast_threshold_on": 0.182},
     )
     noise = EvsNoise(spec.evs, Layout.full(spec), spec.device_seed, np.ones(1))
-    stage, dark = EvsStage(noise, 4), jit().Float(np.zeros(SIDE * SIDE, np.float32))
+    stage, dark = EvsStage(noise, 4), from_host(jit().Float, np.zeros(SIDE * SIDE, np.float32))
     found = np.array([stage.step(dark, 1000 * k).size for k in range(81)])[1:].reshape(4, 20).sum(axis=1)
     assert found.min() > 5000
     assert stats.chi2.sf(np.sum((found - found.mean()) ** 2) / (1.2 * found.mean()), 3) > 1e-6
@@ -83,7 +84,7 @@ def test_the_start_is_the_same_for_any_region_and_continues():
     part = EvsNoise(whole.spec, Layout(whole.layout.spec, 24, 8, 40, 56), whole.device_seed, np.ones(1))
 
     def run(noise, times_us, stop=None):
-        light = jit().Float(np.full(int(np.prod(noise.layout.evs_shape)), 0.2, np.float32))
+        light = from_host(jit().Float, np.full(int(np.prod(noise.layout.evs_shape)), 0.2, np.float32))
         stage, found = EvsStage(noise, 11), []
         for t_us in times_us:
             if t_us == stop:
@@ -106,7 +107,7 @@ def test_the_start_is_the_same_for_any_region_and_continues():
 def test_other_seeds_start_otherwise_and_noise_free_pixels_at_their_own_level():
     noise = pixels()
     size = int(np.prod(noise.layout.evs_shape))
-    light = jit().Float(np.full(size, 0.4, np.float32))
+    light = from_host(jit().Float, np.full(size, 0.4, np.float32))
     found = []
     for model, seed in ((noise, 1), (noise, 2), (noise.clean(), 1)):
         stage = EvsStage(model, seed)

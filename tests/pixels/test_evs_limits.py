@@ -13,6 +13,7 @@ from hesim_render.capture.loop import Capture
 from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import photoreceptor
 from hesim_render.pixels.evs.events import EVENT_DTYPE
@@ -52,11 +53,11 @@ def asynchronous(side=16, **overrides):
 def electrons(log_x, noise):
     """Electrons of a window at which ln x is `log_x`, on the device."""
     values = np.broadcast_to(np.expm1(log_x) * WINDOW_US / (K * T_REF_US), noise.layout.evs_shape)
-    return jit().Float(np.ascontiguousarray(values, dtype=np.float32).ravel())
+    return from_host(jit().Float, values)
 
 
 def logs(values):
-    return jit().Float(np.atleast_1d(np.asarray(values, dtype=np.float32)))
+    return from_host(jit().Float, np.atleast_1d(np.asarray(values, dtype=np.float32)))
 
 
 def filtered(spec, times_us, log_x, side=16):

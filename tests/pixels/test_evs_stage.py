@@ -7,6 +7,7 @@ from scipy import stats
 
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.pixels.evs.model import EvsNoise
@@ -46,7 +47,7 @@ def electrons_at(log_x, window_us=1000):
 
 
 def on_device(values):
-    return jit().Float(np.ascontiguousarray(values, dtype=np.float32).ravel())
+    return from_host(jit().Float, values)
 
 
 #: Rates of both polarities of the comparators' own noise.

@@ -7,6 +7,7 @@ from scipy import linalg
 import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.pixels.evs.photoreceptor import Photoreceptor
 from hesim_render.pixels.evs.processes import BandNoise, _step
 from hesim_render.pixels.evs.stage import EvsStage
@@ -47,12 +48,12 @@ def test_a_step_of_the_noise_against_the_matrix_exponential(h):
     z = rng.standard_normal((2, n)).astype(np.float32)
     transition = linalg.expm(h * np.array([[0.0, 1.0], [-1.0, -2.0]]))
     fresh = np.eye(2) - transition @ transition.T
-    zero = types.Float(np.zeros(n, np.float32))
-    wide = types.Float(np.full(n, h, np.float32))
+    zero = from_host(types.Float, np.zeros(n, np.float32))
+    wide = from_host(types.Float, np.full(n, h, np.float32))
     # without new noise: the transition; each entry to float32
-    kept = np.array([np.array(v) for v in _step(*(types.Float(v) for v in start), wide, (zero, zero))])
+    kept = np.array([np.array(v) for v in _step(*(from_host(types.Float, v) for v in start), wide, (zero, zero))])
     np.testing.assert_allclose(kept, transition @ start, atol=3e-6)
-    added = np.array([np.array(v) for v in _step(zero, zero, wide, tuple(types.Float(v) for v in z))])
+    added = np.array([np.array(v) for v in _step(zero, zero, wide, tuple(from_host(types.Float, v) for v in z))])
     # the same deviates have these exact coefficients: u from the first one alone
     root = np.linalg.cholesky(fresh)
     for row, expected in zip(added, root, strict=True):
@@ -65,7 +66,7 @@ def test_variance_and_correlation_are_those_of_each_pixels_own_corner(approach, 
     noise = sensor(128, 64, with_approach(approach)).evs
     types, width = jit(), 128 * 64
     signal = np.repeat(SIGNALS, width // len(SIGNALS))
-    log, _ = noise.log_level(types.Float(electrons(noise, signal).astype(np.float32)))
+    log, _ = noise.log_level(from_host(types.Float, electrons(noise, signal)))
     photoreceptor = Photoreceptor(noise)
     photoreceptor.start(log, 0)
     band = BandNoise(noise, 7, photoreceptor)
@@ -97,7 +98,7 @@ def test_the_variance_falls_with_the_corner_below_the_noises_bandwidth(approach,
     apart = {"evs.contrast_threshold_on": 0.31}  # renders are as exact as the lower threshold asks for: OFF, 0.2
     noise = sensor(4, 1, apart | with_approach(approach)).evs
     plain = hr.load_sensor("davis346", apart).crop(4, 1).evs
-    counted = jit().Float(electrons(noise, SIGNALS).astype(np.float32))
+    counted = from_host(jit().Float, electrons(noise, SIGNALS))
     ratio = np.array(noise.log_level(counted)[1]) / np.array(plain.log_level(counted)[1])
     np.testing.assert_allclose(ratio, shares, rtol=1e-4)
     # renders are asked for the noise that is there
@@ -120,7 +121,7 @@ def test_events_of_filtered_noise_do_not_depend_on_sampling_or_on_a_stop():
         stage, found = EvsStage(noise, 5), []
         for t in times:
             dn = 25.0 * (26.0 / 25.0) ** (t / 80_000) - 5.0  # ln x, with its base of 5, on a straight line
-            found.append(stage.step(types.Float(electrons(noise, np.full(256, dn)).astype(np.float32)), t))
+            found.append(stage.step(from_host(types.Float, electrons(noise, np.full(256, dn))), t))
             if t == cut:
                 state, stage = stage.state(), EvsStage(noise, 5)
                 stage.resume(state)

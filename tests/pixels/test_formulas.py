@@ -17,6 +17,7 @@ from scipy import integrate, stats
 from hesim_render.calibrate import read_calibration
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import NUMPY, device_namespace
+from hesim_render.core.host_arrays import from_host
 from hesim_render.pixels.aps import formulas as aps
 from hesim_render.pixels.evs import formulas as evs
 
@@ -32,9 +33,7 @@ def on_host(values):
 #: Array library, how it takes values and gives them back, and the relative error of its floats.
 LIBRARIES = {
     "numpy": SimpleNamespace(xp=lambda: NUMPY, take=on_host, rtol=1e-12),
-    "drjit": SimpleNamespace(
-        xp=device_namespace, take=lambda v: jit().Float(np.asarray(v, dtype=np.float32)), rtol=2e-6
-    ),
+    "drjit": SimpleNamespace(xp=device_namespace, take=lambda v: from_host(jit().Float, v), rtol=2e-6),
 }
 
 

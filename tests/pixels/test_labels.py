@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import partners
 from hesim_render.pixels.evs.cause_pairs import CAUSE, EFFECT, Balance, LastSteps, PixelSteps
@@ -49,7 +50,7 @@ def run(noise, times_us, level=light, labels=True, seed=9):
     labeller = Labeller(noise, seed, int(times_us[-1])) if labels else None
     stage = EvsStage(noise, seed, labels=labeller)
     parts = [
-        stage.step(jit().Float(((np.exp(level(t)) - 1) / 2).astype(np.float32)), int(t)) for t in times_us
+        stage.step(from_host(jit().Float, (np.exp(level(t)) - 1) / 2), int(t)) for t in times_us
     ]  # fmt: skip
     return np.concatenate(parts), EventLabels.of([labeller.taken()]) if labels else None
 
@@ -320,7 +321,7 @@ def test_labels_neither_drift_nor_need_more_memory_as_time_goes_on(dead_us):
         for k in range(70):
             on = (k // 5) % 2 * 1.1 + generator.normal(0, 0.05, SIZE)
             t_us = (stage.t_us or 0) + 1_000
-            count += stage.step(jit().Float(((101.0 * np.exp(on) - 1) / 2).astype(np.float32)), t_us).size
+            count += stage.step(from_host(jit().Float, (101.0 * np.exp(on) - 1) / 2), t_us).size
             blocks.append(labeller.taken())
         held.append(nbytes(labeller))
         assert sum(block.label.size for block in blocks) == count > 30_000
@@ -338,7 +339,7 @@ def test_what_is_let_go_of_changes_no_label(monkeypatch):
         labeller = Labeller(noise, 9, 10**9)
         stage = EvsStage(noise, 9, labels=labeller)
         for t in TICKS:
-            stage.step(jit().Float(((np.exp(light(t)) - 1) / 2).astype(np.float32)), int(t))
+            stage.step(from_host(jit().Float, (np.exp(light(t)) - 1) / 2), int(t))
         verdicts = labeller._partners._verdicts
         found.append((EventLabels.of([labeller.taken()]).label, verdicts._open.shape[1], verdicts._given.size))
     np.testing.assert_array_equal(found[0][0], found[1][0])

@@ -9,6 +9,7 @@ from scipy import stats
 
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream, device_normal
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs.events import EVENT_DTYPE, Origin
@@ -39,7 +40,7 @@ def pixels(leak, sigma=0.0, **overrides):
 
 def run(noise, until_us, electrons=0.0, seed=3, **keys):
     """Times in µs after the first sample, flat pixels and polarities of all events."""
-    light, stage = jit().Float(np.full(PIXELS, electrons, np.float32)), EvsStage(noise, seed, **keys)
+    light, stage = from_host(jit().Float, np.full(PIXELS, electrons, np.float32)), EvsStage(noise, seed, **keys)
     stage.step(light, 7_000)
     events = np.concatenate([stage.step(light, 7_000 + int(t)) for t in until_us])
     place = events["y"].astype(int) * SHAPE[1] + events["x"]
@@ -118,7 +119,7 @@ def test_the_last_event_lies_back_by_its_own_law(events_hz):
     """Drift of 2.6 events/s; noise events end it earlier: what passed is exponential, cut at a whole drift."""
     drift = LeakDrift(pixels({"process": "drift", "rate_hz": 2.6}))
     chance = np.linspace(0.01, 0.99, PIXELS)
-    drift.start(jit().Float(np.zeros(PIXELS, np.float32)), False, np.full(PIXELS, events_hz), chance)
+    drift.start(from_host(jit().Float, np.zeros(PIXELS, np.float32)), False, np.full(PIXELS, events_hz), chance)
     passed_s = chance / 2.6
     if events_hz:
         passed_s = stats.truncexpon(events_hz / 2.6, scale=1 / events_hz).ppf(chance)
@@ -127,7 +128,7 @@ def test_the_last_event_lies_back_by_its_own_law(events_hz):
 
 def test_the_way_at_an_event_counts_from_the_last_sample():
     drift = LeakDrift(pixels({"process": "drift", "rate_hz": 2.6}))
-    light = jit().Float(np.zeros(PIXELS, np.float32))
+    light = from_host(jit().Float, np.zeros(PIXELS, np.float32))
     drift.start(light, True, np.zeros(PIXELS), np.zeros(PIXELS))
     events = np.zeros(2, EVENT_DTYPE)
     events["t_us"], events["x"], events["y"], events["polarity"] = (252_000, 257_000), (5, 9), (3, 3), 1
@@ -191,7 +192,7 @@ def test_changing_light_is_integrated():
     noise = pixels(leak, evs__coefficients=[{"beta1": 0.0, "beta2": 1.0, "beta3": 0.0, "beta4": 0.0}])
     per_electron = 0.2 * 10_000 / noise.spec.window_us * 1.3
     stage = EvsStage(noise, 3, is_reset=True)
-    light = [jit().Float(np.full(PIXELS, value, np.float32)) for value in (0.0, 12.0)]
+    light = [from_host(jit().Float, np.full(PIXELS, value, np.float32)) for value in (0.0, 12.0)]
     stage.step(light[0], 1_000)
     events = stage.step(light[1], 401_000)
     one = events[(events["x"] == 5) & (events["y"] == 9)]["t_us"] - 1_000
@@ -206,7 +207,7 @@ def test_changing_light_is_integrated():
 def test_an_on_event_is_the_drifts_from_half_a_threshold_on():
     """At 2 Hz the drift has passed 0.45 and 0.55 of a threshold after 225 and 275 ms; OFF events are never its own."""
     drift = LeakDrift(pixels({"process": "drift", "rate_hz": 2.0, "rate_hz_per_dn": 0.0, "spread_rel": 0.0}))
-    dark = jit().Float(np.zeros(PIXELS, np.float32))
+    dark = from_host(jit().Float, np.zeros(PIXELS, np.float32))
     drift.start(dark, True, np.zeros(PIXELS), np.zeros(PIXELS))
     given = [(225, 3, 1, 1), (275, 4, 1, 1), (290, 2, 7, -1), (490, 4, 1, 1), (530, 3, 1, 1), (560, 2, 7, 1)]
     events = np.array([(1000 * ms + 50, x, y, p) for ms, x, y, p in given], EVENT_DTYPE)
@@ -222,14 +223,14 @@ def test_origin_and_label():
     noise = pixels({"process": "drift", "rate_hz": 4.0, "spread_rel": 0.1})
     labeller = Labeller(noise, 3, 10**9)
     stage = EvsStage(noise, 3, labels=labeller)
-    bright = jit().Float(np.full(PIXELS, 9.0, np.float32))
+    bright = from_host(jit().Float, np.full(PIXELS, 9.0, np.float32))
     stage.step(bright, 1_000)
     for k in range(1, 6):
         stage.step(bright, 1_000 + 100_000 * k)
     found = labeller.taken().label
     assert found.size > PIXELS
     assert np.all(found == 2)
-    up = jit().Float(np.full(PIXELS, 22.0, np.float32))
+    up = from_host(jit().Float, np.full(PIXELS, 22.0, np.float32))
     stage.step(up, 501_200)
     stage.step(up, 501_400)
     found = labeller.taken().label
@@ -239,7 +240,7 @@ def test_origin_and_label():
 def test_a_state_goes_on():
     """A stage that is saved and resumed gives the same events."""
     noise = pixels({"process": "drift", "rate_hz": 6.0, "tail_hz": 0.4}, 0.05)
-    light = jit().Float(np.full(PIXELS, 2.0, np.float32))
+    light = from_host(jit().Float, np.full(PIXELS, 2.0, np.float32))
     whole, first = EvsStage(noise, 3), EvsStage(noise, 3)
     for stage in (whole, first):
         stage.step(light, 0)

@@ -9,6 +9,7 @@ from scipy import stats
 
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream, device_normal
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps.fixed_pattern import FixedPattern
@@ -326,7 +327,7 @@ def test_bits_follow_from_the_seed_alone():
     for size in (1, 4097, 100_000):
         first = 0 if size > 1 else 777
         pieces = [
-            np.array(crop.sample_dn(types.Float(flat[k : k + size]), EXPOSURE_US, 7, 3, first_pixel=k))
+            np.array(crop.sample_dn(from_host(types.Float, flat[k : k + size]), EXPOSURE_US, 7, 3, first_pixel=k))
             for k in range(first, len(flat) if size > 1 else first + 1, size)
         ]
         joined = np.concatenate(pieces)

@@ -6,6 +6,7 @@ from scipy import stats
 
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream, device_normal
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs.model import EVS_TERMS, LEAST_THRESHOLD_REL, EvsNoise
@@ -73,7 +74,7 @@ def test_device_level_matches(law):
     ]
     noise = model("eiger", crop=(64, 64), scale=[1.0, 0.5, 2.0, 1.5], evs__shot_law=law, evs__coefficients=table)
     electrons = np.random.default_rng(0).uniform(0, 500, noise.layout.evs_shape)
-    log, relative = noise.log_level(jit().Float(electrons.astype(np.float32).ravel()))
+    log, relative = noise.log_level(from_host(jit().Float, electrons))
     position = noise.layout.evs_position
     reference = noise.spec.signal_reference
     for p, scale in enumerate((1.0, 0.5, 2.0, 1.5)):
@@ -115,7 +116,7 @@ def test_parameters_of_some_pixels():
     noise = model("eiger", crop=(64, 64), scale=[1.0, 0.5, 2.0, 1.5], evs__coefficients=table,
                   evs__threshold_mismatch_rel=0.1, evs__photoreceptor=corner)  # fmt: skip
     every, chosen = noise.on_device, np.array([700, 3, 4, 98, 1023], np.uint32)
-    some = every.at(jit().UInt32(chosen))
+    some = every.at(from_host(jit().UInt32, chosen))
     log = np.random.default_rng(0).uniform(2.0, 6.0, 32 * 32).astype(np.float32)
     for own, all_ in (
         (some.key, every.key),
@@ -123,8 +124,8 @@ def test_parameters_of_some_pixels():
         (some.thresholds[1], every.thresholds[1]),
         (some.log_of_largest_corner, every.log_of_largest_corner),
         (
-            some.corner_hz(jit().Float(log[chosen]), noise.photoreceptor),
-            every.corner_hz(jit().Float(log), noise.photoreceptor),
+            some.corner_hz(from_host(jit().Float, log[chosen]), noise.photoreceptor),
+            every.corner_hz(from_host(jit().Float, log), noise.photoreceptor),
         ),
     ):
         expected = np.array(all_)[chosen]

@@ -15,6 +15,7 @@ from hesim_render.capture.lab import write_captures
 from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream, device_normal
 from hesim_render.pixels.aps.model import APS_TERMS
 from hesim_render.pixels.evs import formulas as evs_formulas
@@ -39,7 +40,7 @@ def sensor(**overrides):
 def step_through(stage, times_us, electrons=50.0):
     """Events of a stage in constant light."""
     rows, cols = stage.noise.layout.evs_shape
-    light = jit().Float(np.full(rows * cols, electrons, np.float32))
+    light = from_host(jit().Float, np.full(rows * cols, electrons, np.float32))
     return np.concatenate([stage.step(light, t) for t in times_us])
 
 
@@ -227,7 +228,7 @@ def test_moments_of_flicker_are_their_sums():
 
 def test_stuck_pixels_see_nothing_and_the_others_what_they_saw():
     plain, broken = sensor(), sensor(evs__defects={"stuck_share": 0.1})
-    light = [jit().Float(np.full(SIDE * SIDE, value, np.float32)) for value in (50.0, 80.0, 50.0)]
+    light = [from_host(jit().Float, np.full(SIDE * SIDE, value, np.float32)) for value in (50.0, 80.0, 50.0)]
 
     def events(given):
         stage = EvsStage(given.evs, 1)
@@ -358,7 +359,7 @@ def test_telegraph_noise_has_its_variance_and_autocovariance():
     np.testing.assert_allclose(more.ravel()[jumps.place], variance)
     assert np.count_nonzero(more) == n
     # pieces and crops have the same bits
-    flat = jit().Float(np.full(700, 500.0, np.float32))
+    flat = from_host(jit().Float, np.full(700, 500.0, np.float32))
     piece = given.sample_dn(flat, 10_000, 8, 5, first_pixel=1000).numpy()
     np.testing.assert_array_equal(piece, given.sample(image, 10_000, 8, 5).ravel()[1000:1700])
 
@@ -434,7 +435,7 @@ def test_a_calibrated_sensor_misbehaves_alike(events_session):
         assert np.median(getattr(found, name)[flicker]) == pytest.approx(expected, rel=0.25), name
     # events in the dark: the sum over pixels of each kind is that of the captures
     rows, cols = again.layout.evs_shape
-    dark = jit().Float(np.zeros(rows * cols, np.float32))
+    dark = from_host(jit().Float, np.zeros(rows * cols, np.float32))
     counts = np.zeros((2, rows * cols))
     tick_us = given.spec.evs.tick_us
     for k, one in enumerate((given, again)):

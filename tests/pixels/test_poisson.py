@@ -8,6 +8,7 @@ import pytest
 from scipy import special, stats
 
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream, normal_pair, philox
 from hesim_render.pixels.aps.poisson import _log_probability, poisson
 
@@ -74,11 +75,13 @@ def test_a_pixel_does_not_depend_on_its_neighbours():
     rng = np.random.default_rng(0)
     mean = (10.0 ** rng.uniform(-2, 5, 10_000)).astype(np.float32)
     pixel = np.arange(10_000, dtype=np.uint32)
-    together = np.array(poisson(types.Float(mean), philox(3, Stream.APS, types.UInt32(pixel), 7)))
+    together = np.array(poisson(from_host(types.Float, mean), philox(3, Stream.APS, from_host(types.UInt32, pixel), 7)))
     order = rng.permutation(10_000)[:3333]
-    alone = np.array(poisson(types.Float(mean[order]), philox(3, Stream.APS, types.UInt32(pixel[order]), 7)))
+    alone = np.array(
+        poisson(from_host(types.Float, mean[order]), philox(3, Stream.APS, from_host(types.UInt32, pixel[order]), 7))
+    )
     np.testing.assert_array_equal(together[order], alone)
-    other = np.array(poisson(types.Float(mean), philox(3, Stream.APS, types.UInt32(pixel), 8)))
+    other = np.array(poisson(from_host(types.Float, mean), philox(3, Stream.APS, from_host(types.UInt32, pixel), 8)))
     assert np.mean(other != together) > 0.5
 
 
@@ -87,7 +90,7 @@ def test_probabilities_are_good_to_single_precision(mean):
     types = jit()
     width = 7 * math.sqrt(mean)
     k = np.unique(np.linspace(max(mean - width, 0), mean + width, 4001).astype(int)).astype(float)
-    deviance, scale = _log_probability(types.Float(k.astype(np.float32)), dr.full(types.Float, mean, len(k)))
+    deviance, scale = _log_probability(from_host(types.Float, k), dr.full(types.Float, mean, len(k)))
     ours = np.exp(-np.array(deviance, dtype=float)) / np.array(scale, dtype=float)
     # ln of the probability in double precision, from Stirling's series where lgamma would cancel
     exact = np.where(k < 1e4, stats.poisson.logpmf(k, mean), 0.0)
@@ -119,7 +122,7 @@ def test_normal_deviates_reach_into_the_tail():
 
 def test_normal_deviates_at_the_ends_of_the_words():
     types = jit()
-    ends = types.UInt32(np.array([0, 1, 2**31, 2**32 - 1], dtype=np.uint32))
+    ends = from_host(types.UInt32, [0, 1, 2**31, 2**32 - 1])
     first, second = (np.array(v) for v in normal_pair(ends, types.UInt32(0, 0, 0, 0)))
     assert np.all(np.isfinite(first)) and np.all(second == 0)
     # the smallest radius word is the uniform 2^-33

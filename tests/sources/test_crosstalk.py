@@ -9,6 +9,7 @@ import hesim_render as hr
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.recording.frame import Frame
 from hesim_render.sources.crosstalk import CrosstalkFlux, mixed, with_crosstalk
 from hesim_render.sources.still import WindowByWindow
@@ -36,7 +37,7 @@ class Still(WindowByWindow):
         assert pixel.dtype == np.uint32
         self.asked.append(pixel)
         values = self.image.ravel()[pixel] * self.level(np.asarray(begin_us), np.asarray(end_us))
-        return jit().Float((1.01 * values).astype(np.float32)), jit().Float((0.99 * values).astype(np.float32))
+        return from_host(jit().Float, 1.01 * values), from_host(jit().Float, 0.99 * values)
 
 
 class Rising(Still):

@@ -10,6 +10,7 @@ from hesim_render.capture.loop import Capture
 from hesim_render.capture.run_settings import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.flicker import FlickerFlux
 from hesim_render.sources.protocol import Sample
@@ -48,7 +49,7 @@ class Formula(WindowByWindow):
         self.asked.append(np.array(pixel))
         middle = 0.5e-6 * (np.asarray(begin_us, dtype=float) + np.asarray(end_us, dtype=float))
         flux = np.broadcast_to(self.base * (1 + self.slope * middle), np.shape(pixel))
-        return jit().Float(flux * 1.01), jit().Float(flux * 0.99)
+        return from_host(jit().Float, flux * 1.01), from_host(jit().Float, flux * 0.99)
 
 
 class Windows(Formula):
@@ -472,7 +473,8 @@ def test_errors_of_pieces_add_and_those_of_lights_are_independent(has_error):
     a, b = rng.uniform(10, 90, (2, 3, 2, 4))
     samples = [
         tuple(
-            Sample(jit().Float(a[p, k]), jit().Float(b[p, k]), error[p, k] if has_error else None) for k in range(2)
+            Sample(*(from_host(jit().Float, half[p, k]) for half in (a, b)), error[p, k] if has_error else None)
+            for k in range(2)
         )
         for p in range(3)
     ]  # fmt: skip

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.tracks import Tracks
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.truth.imu import _velocity
@@ -100,7 +101,7 @@ def test_drjit_evaluation_equals_numpy(repeat):
     local = moving.local_us(times) if repeat else times - 500
     point, direction = np.array([0.7, -0.3, 0.9]), np.array([0.6, 0.0, -0.8])
     vectors = [types.Array3f(*map(float, vector)) for vector in (point, direction)]
-    pose = moving.pose_at(types.Float(local.astype(np.float32)))
+    pose = moving.pose_at(from_host(types.Float, local))
     moved, turned = pose.to_world(vectors[0]), pose.turn_to_world(vectors[1])
     poses = moving.matrix(times)
     np.testing.assert_allclose(np.array(moved).T, poses[:, :3, :3] @ point + poses[:, :3, 3], atol=3e-6)
@@ -156,6 +157,6 @@ def test_many_tracks_of_uneven_keyframes_find_their_segments():
         local = np.concatenate([knots, middles, rng.uniform(0, knots[-1], 3000)]).astype(np.float32)
         wanted = own.matrix(local.astype(np.float64))[:, :3, 3]
         # as a number of all lanes, and as one of each lane
-        for which in (number, types.UInt32(np.full(local.size, number, np.uint32))):
-            found = np.array(together.pose(which, types.Float(local)).shift).T
+        for which in (number, from_host(types.UInt32, np.full(local.size, number, np.uint32))):
+            found = np.array(together.pose(which, from_host(types.Float, local)).shift).T
             np.testing.assert_allclose(found, wanted, atol=2e-4)

@@ -6,6 +6,7 @@ import pytest
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import device_namespace
+from hesim_render.core.host_arrays import from_host
 from hesim_render.spectral.colorimetry import delta_e_2000, delta_e_2000_of, delta_e_ab, lab, lab_of
 
 #: Pairs of [sharma2005] at which implementations differ: hues on both sides of 0°, greys, the turn at 275°.
@@ -35,10 +36,7 @@ def test_random_colours_are_those_of_colour_science():
     np.testing.assert_allclose(delta_e_ab(*ours), colour.delta_E(*theirs, method="CIE 1976"), rtol=1e-9)
     # single precision on the device
     xp, types = device_namespace(), jit()
-    pair = [
-        lab_of(tuple(types.Float(np.ascontiguousarray(column, np.float32)) for column in (each / white).T), xp)
-        for each in xyz
-    ]
+    pair = [lab_of(tuple(from_host(types.Float, column) for column in (each / white).T), xp) for each in xyz]
     np.testing.assert_allclose(delta_e_2000_of(*pair, xp).numpy(), delta_e_2000(*ours), rtol=2e-4, atol=2e-3)
 
 

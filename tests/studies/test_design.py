@@ -14,6 +14,7 @@ import hesim_render as hr
 from hesim_render import cli
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.specs.design import CostSpec, DesignSpec
 from hesim_render.specs.files import list_names, read_spec
 from hesim_render.specs.filter_set import read_filter_set
@@ -128,7 +129,7 @@ def test_the_cost_is_that_of_its_formula():
     curves = np.exp(-(((BANDS - np.array([[600], [540], [460]])) / 50) ** 2)) * 1e7 * rng.uniform(0.8, 1.2, (3, 1))
     for weights in ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0.3, 0.5, 0.2)):
         cost = cost_of(weights)
-        found = float(cost([jit().Float64(curve) for curve in curves])[0])
+        found = float(cost([from_host(jit().Float64, curve) for curve in curves])[0])
         assert found == pytest.approx(reference(cost, curves), rel=2e-4)
 
 
@@ -194,7 +195,7 @@ def test_gradients_of_the_cost_are_central_differences(family):
     tensors = [numbers(own) for own in values]
     for own in tensors:
         dr.enable_grad(own)
-    curves = [family.transmittance(own) * jit().Float64(scale) for own in tensors]
+    curves = [family.transmittance(own) * from_host(jit().Float64, scale) for own in tensors]
     dr.backward(cost(curves))
     found = np.array([float(dr.grad(value)[0]) for own in tensors for value in own])
     expected = np.empty_like(found)
@@ -375,7 +376,7 @@ def test_slopes_above_the_largest_cost_their_square():
     slopes = np.zeros(94)
     slopes[3:23], slopes[40:47], slopes[60:75] = 0.003, -0.006, 0.00199
     curve = 0.3 + np.append(0, np.cumsum(5 * slopes))
-    found = problem._steepness(jit().Float64(curve))[0]
+    found = problem._steepness(from_host(jit().Float64, curve))[0]
     assert found == pytest.approx(1000 * (20 * 0.5**2 + 7 * 2.0**2) / 94, rel=1e-9)
 
 

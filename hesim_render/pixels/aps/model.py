@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import NUMPY, Float, Namespace, UInt32, Values
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.plain import PlainState
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
@@ -318,7 +319,7 @@ class ApsNoise(PlainState):
         types = jit()
         if not isinstance(electrons, types.Float):
             image = np.broadcast_to(self._checked(electrons, exposure_us), self.layout.shape)
-            electrons = types.Float(image.astype(np.float32).ravel())
+            electrons = from_host(types.Float, image)
         dn = self.sample_dn(electrons, exposure_us, seed, frame)
         return dn.numpy().astype(np.uint16).reshape(self.layout.shape)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Generator, UInt32, device_namespace
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream, normal_pair, philox
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
@@ -59,7 +60,7 @@ class DeviceMaps:
 
     @cached_property
     def _keys(self) -> UInt32:
-        return jit().UInt32(self._layout.full_index.ravel())
+        return from_host(jit().UInt32, self._layout.full_index)
 
     def keys(self, index: UInt32) -> UInt32:
         """Full-sensor index of pixels of the region. A region as wide as the sensor needs no table."""

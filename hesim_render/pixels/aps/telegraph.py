@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream, device_uniform
 from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.layout import Layout
@@ -67,8 +68,8 @@ class TelegraphPixels:
         types = jit()
         # few pixels have this noise: the host computes them, and zeros fill the region
         every = dr.zeros(types.Float, pixels)
-        values = types.Float(self.values_dn(seed, frame).astype(np.float32))
-        dr.scatter(every, values, types.UInt32(self.place.astype(np.uint32)))
+        values = from_host(types.Float, self.values_dn(seed, frame))
+        dr.scatter(every, values, from_host(types.UInt32, self.place))
         return dr.gather(types.Float, every, index)
 
 

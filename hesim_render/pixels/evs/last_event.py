@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
+from hesim_render.core.host_arrays import from_host, spread_out
 from hesim_render.core.rng import Stream
-from hesim_render.core.tables import spread_out
 from hesim_render.pixels.arrays import take
 from hesim_render.pixels.evs.crossings import DueEvents, events_on_paths, listed
 from hesim_render.pixels.evs.defects import DefectEvents
@@ -108,7 +108,7 @@ class LastEvent:
             # reference and dead time of each pixel are drawn from the stationary law of its light
             spreads = np.broadcast_to(spread.numpy(), count)
             begin = start_of(self._noise, self._seed, spreads, share, self._band_noise.angle)
-            self.reference = dr.fma(spread, jit().Float(begin.reference), log)
+            self.reference = dr.fma(spread, from_host(jit().Float, begin.reference), log)
             if self._refractory:
                 self._refractory.begin(np.where(begin.dead_us > 0, self._t_us + begin.dead_us, LONG_AGO_US))
             events_hz, chance = begin.events_hz, begin.chance
@@ -160,7 +160,7 @@ class LastEvent:
         if self._drift:
             events = events[np.argsort(events["t_us"], kind="stable")]
             # a long way of the drift is taken off level and reference together, so that float32 keeps small steps
-            lower = jit().Float(self._drift.pass_by(events, self._cols, electrons, self._t_us, t_us))
+            lower = from_host(jit().Float, self._drift.pass_by(events, self._cols, electrons, self._t_us, t_us))
             self.level, self.reference = self.level - lower, self.reference - lower
             dr.eval(self.level, self.reference)
         events = np.concatenate([events, *beside])
@@ -192,7 +192,7 @@ class LastEvent:
         if len(result) == 0:
             return no_events()
         # only pixels with an event go to the host
-        pixel = types.UInt32(result.astype(np.uint32))
+        pixel = from_host(types.UInt32, result)
         gathered = [dr.gather(types.Float, value, pixel) for value in (crossed, *before, level)]
         gathered.append(dr.select(gathered[0] > 0, take(theta_on, pixel), -take(theta_off, pixel)))
         dr.eval(gathered)
@@ -262,7 +262,7 @@ class LastEvent:
         is_due[due[1]] = True
         parts = [no_events()]
         for pixel in np.split(every, range(_PATHS, every.size, _PATHS)) if every.size else ():
-            index = types.UInt32(pixel)
+            index = from_host(types.UInt32, pixel)
             line = take(first, index), take(last, index)
             curve, least, most = low_pass.along(begin, end.log, index, times_us[1:], line)
             own = take(self.reference, index)
@@ -273,7 +273,7 @@ class LastEvent:
             # only paths with an event or a new reference go to the host
             kept = np.flatnonzero(np.array(crosses) | is_due[pixel]).astype(np.uint32)
             if kept.size:
-                start = np.array(take(before, types.UInt32(pixel[kept])))
+                start = np.array(take(before, from_host(types.UInt32, pixel[kept])))
                 followed = np.array(_columns(curve, kept, pixel.size, len(times_us) - 1)).reshape(-1, kept.size)
                 paths = np.concatenate([start[None], followed])
                 parts.append(self._events_on_paths(pixel[kept], paths, times_us, due))
@@ -285,7 +285,7 @@ class LastEvent:
     ) -> NDArray[np.void]:
         """Events of some pixels, whose references go on with them; see `events_on_paths`."""
         types = jit()
-        index = types.UInt32(pixel)
+        index = from_host(types.UInt32, pixel)
         own = np.array(take(self.reference, index)).astype(np.float64)
         on, off = (
             np.broadcast_to(np.array(take(theta, index)), own.shape).astype(np.float64)
@@ -296,7 +296,7 @@ class LastEvent:
             own, t_us, fired, polarity = self._refractory.crossings_on_curves(*given)
         else:
             own, _, t_us, fired, polarity = events_on_paths(*given, np.full(own.size, LONG_AGO_US), None)
-        dr.scatter(self.reference, types.Float(own.astype(np.float32)), index)
+        dr.scatter(self.reference, from_host(types.Float, own), index)
         return events_at(self._stamp(t_us), fired, polarity, self._cols)
 
     def _due(self, begin_us: float, end_us: float) -> DueEvents:

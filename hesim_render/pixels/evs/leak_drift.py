@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Float64
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream, device_normal, device_uniform
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.events import Origin
@@ -51,8 +52,8 @@ class LeakDrift:
         unit = noise.spec.contrast_threshold_on / US_PER_S
         per_electron = noise.dn_per_electron[layout.evs_position.ravel()]
         types = jit()
-        self._dark: Float64 = types.Float64(unit * (relative * spec.rate_hz + tail_hz))
-        self._light: Float64 = types.Float64(unit * relative * spec.rate_hz_per_dn * per_electron)
+        self._dark: Float64 = from_host(types.Float64, unit * (relative * spec.rate_hz + tail_hz))
+        self._light: Float64 = from_host(types.Float64, unit * relative * spec.rate_hz_per_dn * per_electron)
         self._theta_on = np.broadcast_to(np.ravel(noise.threshold_on_map), size).astype(np.float64)
         self._way: Float64 = None  # since the start, at the last sample
         self._per_us: Float64 = None  # speed at the last sample
@@ -82,7 +83,7 @@ class LeakDrift:
             few = ends < 1e-6
             late_us = -np.log1p(chance * np.expm1(-ends)) / np.where(few, 1.0, per_event)
             way = np.minimum(np.where(few, chance * whole_us, late_us), whole_us) * per_us
-        self._way = jit().Float64(way)
+        self._way = from_host(jit().Float64, way)
         self._at_event = np.zeros(self._theta_on.size)
         dr.eval(self._way, self._per_us)
 
@@ -123,7 +124,7 @@ class LeakDrift:
         if events.size:
             pixel = events["y"].astype(np.uint32) * np.uint32(cols) + events["x"]
             order = np.argsort(pixel, kind="stable")
-            place = types.UInt32(pixel[order])
+            place = from_host(types.UInt32, pixel[order])
             # way of each event's pixel at the time of the event: the speed goes on a line between both samples
             way, before, after = (
                 np.array(dr.gather(types.Float64, values, place)) for values in (self._way, self._per_us, later)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32, device_namespace
+from hesim_render.core.host_arrays import from_host
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.arrays import take, to_device
 from hesim_render.pixels.evs import formulas
@@ -49,7 +50,7 @@ class EventPixels:
         bandwidth_hz: float | None,
     ) -> None:
         self._law = law
-        self.key: UInt32 = jit().UInt32(layout.full_index.ravel()[layout.evs_pixel.ravel()])
+        self.key: UInt32 = from_host(jit().UInt32, layout.full_index.ravel()[layout.evs_pixel.ravel()])
         self.thresholds: tuple[Float, Float] = (to_device(thresholds[0]), to_device(thresholds[1]))
         of_position = _by_position(layout)
         self._coefficients = table.each(of_position)
@@ -99,7 +100,7 @@ def _by_position(layout: Layout) -> Callable[[NDArray[np.float64]], Float]:
         if np.all(values == values[0]):
             return to_device(values[0])
         if position is None:
-            position = jit().UInt32(layout.evs_position.ravel().astype(np.uint32))
+            position = from_host(jit().UInt32, layout.evs_position)
             dr.eval(position)
         return dr.gather(jit().Float, to_device(values), position)
 

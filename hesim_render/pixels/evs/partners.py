@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float
+from hesim_render.core.host_arrays import from_host
 from hesim_render.pixels.evs.cause_pairs import CAUSE, EFFECT, Balance, LastSteps, PixelSteps
 from hesim_render.pixels.evs.events import Label, Origin
 from hesim_render.pixels.evs.model import EvsNoise
@@ -234,7 +235,7 @@ def _take_over(pixels: EvsStage, reference: Float, which: NDArray[np.int64]) -> 
     if which.size == 0:
         return np.empty(0, np.float32)
     types = jit()
-    index = types.UInt32(which.astype(np.uint32))
+    index = from_host(types.UInt32, which)
     before, now = (dr.gather(types.Float, level, index) for level in (pixels.reference, reference))
     dr.eval(before, now)
     own = dr.copy(pixels.reference)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.arrays import take
 from hesim_render.pixels.evs.formulas import POLE
@@ -169,8 +169,7 @@ class Photoreceptor:
         before, after, z, y = (take(values, pixel) for values in (begin.log, log, begin.z, begin.y))
         since_us = times_us - begin.t_us
         elapsed_us, parts = (
-            table(types.Float, values.astype(np.float32))
-            for values in (np.diff(since_us, prepend=0.0), since_us / since_us[-1])
+            from_host(types.Float, values) for values in (np.diff(since_us, prepend=0.0), since_us / since_us[-1])
         )
         lane, lanes = dr.arange(types.UInt32, dr.width(pixel)), dr.opaque(types.UInt32, dr.width(pixel))
         nodes, result = dr.opaque(types.UInt32, count), dr.empty(types.Float, count * dr.width(pixel))

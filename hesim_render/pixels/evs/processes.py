@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Float64, UInt32
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream, device_normal, normal_pair, philox, stream_key
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.formulas import POLE
@@ -67,7 +68,7 @@ class BandNoise:
         self._fresh = self._amplitude * np.linalg.cholesky(fresh)
         self._photoreceptor, self._largest = photoreceptor, h
         own = bandwidth_map(noise)
-        self._own: Float = None if own is None else jit().Float(h * own / np.float32(most_bandwidth(noise)))
+        self._own: Float = None if own is None else from_host(jit().Float, h * own / np.float32(most_bandwidth(noise)))
         self._is_alike = photoreceptor is None and own is None
         if not self._is_alike:
             self._amplitude = 1.0  # each pixel has its own, see `_scale`

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, UInt32
+from hesim_render.core.host_arrays import from_host
 from hesim_render.pixels.arrays import take
 from hesim_render.pixels.evs.crossings import DueEvents, events_on_paths, level_at, listed
 
@@ -35,7 +36,7 @@ class Refractory:
 
     def begin(self, ready_us: NDArray[np.float64]) -> None:
         """Let each pixel be ready at a time [pixel], µs."""
-        self._ready_us = jit().Float64(ready_us)
+        self._ready_us = from_host(jit().Float64, ready_us)
 
     def crossings(
         self,
@@ -77,7 +78,7 @@ class Refractory:
         result = listed(np.array(hit), due)
         if result.size == 0:
             return reference, *(np.empty(0, kind) for kind in (np.float64, np.uint32, np.float64))
-        pixel = types.UInt32(result)
+        pixel = from_host(types.UInt32, result)
         gathered = [dr.gather(types.Float, value, pixel) for value in (reference, level_0, level_1)]
         gathered += [take(theta_on, pixel) + dr.zeros(types.Float, result.size), take(theta_off, pixel)]
         ready = np.array(dr.gather(types.Float64, self._ready_us, pixel))
@@ -85,8 +86,8 @@ class Refractory:
         theta = on, np.broadcast_to(off, result.shape)
         path = np.stack([low, high]), np.array([begin_us, end_us])
         own, ready, *events = events_on_paths(result, *path, own, theta, due, ready, self._period_us)
-        dr.scatter(reference, types.Float(own.astype(np.float32)), pixel)
-        dr.scatter(self._ready_us, types.Float64(ready), pixel)
+        dr.scatter(reference, from_host(types.Float, own), pixel)
+        dr.scatter(self._ready_us, from_host(types.Float64, ready), pixel)
         dr.eval(reference, self._ready_us)
         return reference, *events
 
@@ -101,13 +102,13 @@ class Refractory:
     ) -> tuple[NDArray[np.float64], NDArray, NDArray, NDArray]:
         """Events of some pixels whose levels go on paths of straight lines; see `events_on_paths`."""
         types = jit()
-        index = types.UInt32(pixel)
+        index = from_host(types.UInt32, pixel)
         ready = np.array(dr.gather(types.Float64, self._ready_us, index))
         released = np.flatnonzero((ready > times_us[0]) & (ready <= times_us[-1]))
         reference[released] = level_at(released, ready[released], levels, times_us)
         given = pixel, levels, times_us, reference, thresholds, due, ready, self._period_us
         own, ready, t_us, fired, polarity = events_on_paths(*given)
-        dr.scatter(self._ready_us, types.Float64(ready), index)
+        dr.scatter(self._ready_us, from_host(types.Float64, ready), index)
         dr.eval(self._ready_us)
         return own, t_us, fired, polarity
 

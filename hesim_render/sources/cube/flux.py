@@ -13,7 +13,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Halves, UInt32
 from hesim_render.core.errors import ConflictError, RangeError, SpecError
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W, US_PER_S
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.cube.planes import integrated, integration_weights
@@ -66,9 +66,9 @@ class CubeFlux(WindowByWindow):
         planes = self._planes()
         self._plane_shape = planes.shape[1:]
         types = jit()
-        self._values = table(types.Float, planes)
-        self._filter = types.UInt32(sensor.layout.filter_index.ravel().astype(np.uint32))
-        self._shading = types.Float(sensor.relative_illumination.ravel())
+        self._values = from_host(types.Float, planes)
+        self._filter = from_host(types.UInt32, sensor.layout.filter_index)
+        self._shading = from_host(types.Float, sensor.relative_illumination)
 
     def _planes(self) -> NDArray[np.float32]:
         options, sensor = self.options, self.sensor
@@ -131,7 +131,7 @@ class CubeFlux(WindowByWindow):
         if pixels.size == 0:
             nothing = dr.zeros(types.Float, 0)
             return nothing, nothing
-        index = types.UInt32(pixels)
+        index = from_host(types.UInt32, pixels)
         if self.is_static:
             total = self._at(index, dr.zeros(types.Float, 1))
         else:
@@ -140,7 +140,8 @@ class CubeFlux(WindowByWindow):
             for k in range(number):
                 middle = begin + (end - begin) * ((k + 0.5) / number)
                 seconds = np.atleast_1d(middle / US_PER_S).astype(np.float32)
-                time_s = types.Float(seconds) if seconds.size > 1 else dr.opaque(types.Float, float(seconds[0]))
+                one = seconds.size == 1
+                time_s = dr.opaque(types.Float, float(seconds[0])) if one else from_host(types.Float, seconds)
                 total += self._at(index, time_s) / number
                 dr.eval(total)
         dr.eval(total)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, MitsubaObject, Point2, UInt32
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.units import MM_PER_M
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.specs.lens import GaussianPsf, MeasuredPsf
@@ -46,7 +46,7 @@ class _OverHeight:
         self._sensor = sensor
         pitch_mm = geometry.pitch_um * 1e-3
         far = max(float(np.hypot(geometry.cols, geometry.rows)), max(height_mm) / pitch_mm) + 1
-        self._values = table(types.Float, np.interp(np.linspace(0, far * pitch_mm, _HEIGHTS), height_mm, values))
+        self._values = from_host(types.Float, np.interp(np.linspace(0, far * pitch_mm, _HEIGHTS), height_mm, values))
         self._per_px = dr.opaque(types.Float, (_HEIGHTS - 1) / far)
         dr.make_opaque(self._values)
 
@@ -113,7 +113,7 @@ class KernelBlur:
         by_row = np.cumsum(kernels.sum(axis=2), axis=1)
         within = np.cumsum(kernels, axis=2)
         within /= np.maximum(within[..., -1:], 1e-300)
-        self._row_sums, self._col_sums = (table(types.Float, values.astype(np.float32)) for values in (by_row, within))
+        self._row_sums, self._col_sums = (from_host(types.Float, values) for values in (by_row, within))
         self._on_axis = psf.image_height_mm[0] == 0
         self._which = _OverHeight(sensor, psf.image_height_mm, np.arange(count, dtype=np.float64))
         step_px = psf.sample_um / sensor.spec.geometry.pitch_um
@@ -186,7 +186,7 @@ class AiryBlur:
 
     def __init__(self, sensor: Sensor) -> None:
         types = jit()
-        self._radii = table(types.Float, airy_radii().astype(np.float32))
+        self._radii = from_host(types.Float, airy_radii())
         scale = sensor.lens.working_f_number / (pi * sensor.spec.geometry.pitch_um * MM_PER_M)
         self._px_per_nm = dr.opaque(types.Float, scale)
         dr.make_opaque(self._radii)

@@ -10,6 +10,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Bands, Float, Halves, UInt32
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress
 from hesim_render.mosaic.layout import Layout
@@ -134,9 +135,9 @@ class RenderedFlux(WindowByWindow):
         self.is_static = not self._tracer.built.moves and self._tracer.camera is None
         types = jit()
         self._wavelengths = WavelengthSampler(self.sensor.responses)
-        self._filter = types.UInt32(self.sensor.layout.filter_index.ravel().astype(np.uint32))
+        self._filter = from_host(types.UInt32, self.sensor.layout.filter_index)
         illumination = self.sensor.relative_illumination.ravel() * np.float32(self._tracer.radiance_scale)
-        self._illumination = types.Float(illumination)
+        self._illumination = from_host(types.Float, illumination)
         self._glare: VeilingGlare | None = None
         if self.sensor.optics.veiling_glare > 0 and not self._tracer.built.is_dark:
             filters = np.unique(self.sensor.layout.filter_index).tolist()

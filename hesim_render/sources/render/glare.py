@@ -11,6 +11,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Bands, Float, Halves, UInt32
 from hesim_render.core.distinct import distinct_columns
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream
 from hesim_render.sensor.lens import relative_illumination_at
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
@@ -41,7 +42,7 @@ class VeilingGlare:
         row, col = place.astype(np.int64)
         self._index = (row * geometry.cols + col).ravel().astype(np.uint32)
         light = relative_illumination_at(tracer.sensor.spec, tracer.sensor.lens, row, col)
-        self._light = jit().Float(light.ravel().astype(np.float32) * np.float32(tracer.radiance_scale))
+        self._light = from_host(jit().Float, light.ravel().astype(np.float32) * np.float32(tracer.radiance_scale))
         self._known: tuple[bytes, list[NDArray[np.float64]]] | None = None
 
     def added(
@@ -64,7 +65,7 @@ class VeilingGlare:
         means = np.stack(self._known[1])
         filter_of = self._tracer.sensor.layout.filter_index.ravel()[pixel]
         own_means = means[group[which], filter_of]
-        half_a, half_b = (types.Float(np.ascontiguousarray(values, np.float32)) for values in own_means.T)
+        half_a, half_b = (from_host(types.Float, values) for values in own_means.T)
         return half_a, half_b
 
     def _means(self, spans_us: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.camera import View, place_camera
 from hesim_render.sources.render.framing import Framing, framing, outline, posed_view
@@ -86,8 +87,8 @@ def _colours(mi: MitsubaModule, scene: MitsubaObject, view: View, x: NDArray, y:
     """Colours of the first surfaces behind places of the region (0, 0 is its upper left corner), [n, 3]."""
     types = jit()
     layout = view.sensor.layout
-    row = types.Float((y + layout.row0 - 0.5).astype(np.float32))
-    col = types.Float((x + layout.col0 - 0.5).astype(np.float32))
+    row = from_host(types.Float, y + layout.row0 - 0.5)
+    col = from_host(types.Float, x + layout.col0 - 0.5)
     middle = types.Float(0.5)
     origin, direction = RayFactory(view).rays(row, col, (middle, middle), None)
     bands = mi.UnpolarizedSpectrum(*_COLOURS_NM)

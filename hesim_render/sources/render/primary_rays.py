@@ -10,7 +10,7 @@ import numpy as np
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, MitsubaObject, Point2, Point3, Vector3
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.units import MM_PER_M
 from hesim_render.sources.render.blur import AiryBlur, GaussianBlur, KernelBlur
 from hesim_render.sources.render.camera import View
@@ -50,7 +50,7 @@ class RayFactory:
         if optics.lateral_chromatic is not None:
             chromatic, grid = optics.lateral_chromatic, np.arange(RENDERABLE_NM[0], RENDERABLE_NM[1] + 1)
             larger = np.interp(grid, chromatic.wavelength_nm, chromatic.magnification_rel)
-            self._shrink = table(types.Float, (1 / (1 + larger)).astype(np.float32))
+            self._shrink = from_host(types.Float, (1 / (1 + larger)).astype(np.float32))
             dr.make_opaque(self._shrink)
         self.is_dispersive = self._airy is not None or self._shrink is not None
         self.has_pupil = optics.depth_of_field

@@ -18,7 +18,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Float64
 from hesim_render.core.errors import SpecError
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sensor.distortion import Distortion, fisheye, opencv
 from hesim_render.sensor.sensor import Sensor
 
@@ -173,7 +173,7 @@ class _DeviceDistortion:
         even = np.linspace(0, place[-1], _STARTS)
         ratio = np.interp(even, place, tangent) / np.maximum(even, 1e-300)
         ratio[0] = ratio[1]
-        self._ratio = table(types.Float, ratio.astype(np.float32))
+        self._ratio = from_host(types.Float, ratio)
         self._most = dr.opaque(types.Float, float(place[-1]))
         dr.make_opaque(self._ratio)
 

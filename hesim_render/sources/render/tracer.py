@@ -10,9 +10,9 @@ from hesim_render.core.backend import jit, select
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Bands, Float, Halves, UInt32, UInt64
 from hesim_render.core.errors import RangeError
+from hesim_render.core.host_arrays import from_host, spread_out
 from hesim_render.core.journal import Journal, key_of
 from hesim_render.core.rng import Stream, stream_key
-from hesim_render.core.tables import spread_out
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.light_level import in_absolute_light
@@ -225,7 +225,7 @@ class PixelTracer(Tracer):
         pixels = next(given.size for given in inputs if isinstance(given, np.ndarray))
         known = np.empty((1, 2, pixels), np.float32)
         if self._journal.recall(key, [known]):
-            return [(kind(half_a), kind(half_b)) for half_a, half_b in known]
+            return [(from_host(kind, half_a), from_host(kind, half_b)) for half_a, half_b in known]
         traced = trace()
         self._journal.keep(key, [np.array(half) for halves in traced for half in halves])
         return traced

@@ -11,6 +11,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Halves
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.progress import Progress
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.renderer import Demand, Renderer, Untraced
@@ -118,9 +119,9 @@ class VideoFlux(WindowByWindow, Untraced):
 
         types = jit()
         weights = self.filter_matrix @ to_linear_srgb(self.tags.primaries or "bt709")
-        self._weights = types.Float(weights.astype(np.float32).ravel())
-        self._filter = types.UInt32(sensor.layout.filter_index.ravel().astype(np.uint32) * 3)
-        self._shading = types.Float(sensor.relative_illumination.ravel()) if options.lens_shading else None
+        self._weights = from_host(types.Float, weights)
+        self._filter = from_host(types.UInt32, sensor.layout.filter_index.ravel().astype(np.uint32) * 3)
+        self._shading = from_host(types.Float, sensor.relative_illumination) if options.lens_shading else None
         self._lineariser, self._resample = Lineariser(shape, self.tags), Resampler(self.mapping)
         self._maps: dict[int, Float] = {}
         self._edges = self.clock.hold_us[1:-1] if self._is_held else self.clock.middle_us
@@ -181,7 +182,7 @@ class VideoFlux(WindowByWindow, Untraced):
             nothing = dr.zeros(types.Float, 0)
             return nothing, nothing
         begin, end = _common(begin, end)
-        index = types.UInt32(pixels)
+        index = from_host(types.UInt32, pixels)
         total: Float = 0.0
         for number, share in picture_weights(self._edges, self._is_held, begin, end).items():
             total = dr.fma(dr.gather(types.Float, self._flux_of(number), index), _device(share), total)
@@ -293,7 +294,7 @@ def _device(share: NDArray[np.float64]) -> Float:
     types = jit()
     if share.ndim == 0:
         return dr.opaque(types.Float, float(np.float32(share)))
-    return types.Float(np.ascontiguousarray(share, dtype=np.float32))
+    return from_host(types.Float, share)
 
 
 if TYPE_CHECKING:  # a type checker compares the two

@@ -11,6 +11,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.errors import RangeError
+from hesim_render.core.host_arrays import from_host
 
 Fit = Literal["cover", "stretch", "pixel"]
 
@@ -116,10 +117,8 @@ class Resampler:
         self._shape, self._width = (rows, cols), mapping.source_shape[1]
         if mapping.is_identity:
             return
-        self._first = [types.UInt32(axis.first) for axis in (mapping.rows, mapping.cols)]
-        self._weight = [
-            types.Float(np.ascontiguousarray(axis.weight.T).ravel()) for axis in (mapping.rows, mapping.cols)
-        ]
+        self._first = [from_host(types.UInt32, axis.first) for axis in (mapping.rows, mapping.cols)]
+        self._weight = [from_host(types.Float, axis.weight.T) for axis in (mapping.rows, mapping.cols)]
         dr.eval(self._first, self._weight)
 
     def __call__(self, planes: list[Float]) -> list[Float]:

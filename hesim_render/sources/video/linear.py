@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.video.colours import ColourTags, code_scale, yuv_to_rgb
 from hesim_render.sources.video.picture_layout import PictureFormat, Planes
 from hesim_render.spectral.transfer import decode
@@ -37,13 +38,13 @@ class Lineariser:
         transfer, gamma, range_ = tags.transfer or "srgb", tags.gamma or 2.2, tags.range or "full"
         top = 1.0 if transfer in ("pq", "hlg") else _TOP
         self._top = round(top * _STEPS)
-        self._table = types.Float(decode(np.arange(self._top + 2) / _STEPS, transfer, gamma).astype(np.float32))
+        self._table = from_host(types.Float, decode(np.arange(self._top + 2) / _STEPS, transfer, gamma))
         scale = code_scale(shape.bits, range_) if shape.bits else (0.0, 1.0)
         self._scale = self._opaque(*scale)
         self._by_code = None
         if 0 < shape.bits <= _CODE_BITS and shape.layout != "yuv":
             value = (np.arange(2**shape.bits) - scale[0]) * scale[1]
-            self._by_code = types.Float(decode(np.clip(value, 0, top), transfer, gamma).astype(np.float32))
+            self._by_code = from_host(types.Float, decode(np.clip(value, 0, top), transfer, gamma))
         if shape.layout == "yuv":
             self._chroma_scale = self._opaque(*code_scale(shape.bits or 8, range_, chroma=True))
             self._matrix = [self._opaque(*row) for row in yuv_to_rgb(tags.matrix or "bt709")]
@@ -77,7 +78,7 @@ class Lineariser:
         if picture.dtype != np.uint8:
             samples, first = self._samples(picture), self._index * 3
             return [samples(first + channel) for channel in range(3)]
-        words = types.UInt32(_words(picture))
+        words = from_host(types.UInt32, _words(picture))
         first = self._index * 3
         word, shift = first >> 2, (first & 3) << 3
         # the last pixel has all three bytes in the last word itself
@@ -92,7 +93,7 @@ class Lineariser:
         types = self._types
         flat = plane.reshape(-1)
         if flat.dtype == np.uint16:  # two to a word: Dr.Jit has no 16-bit integers
-            words = types.UInt32(_words(flat))
+            words = from_host(types.UInt32, _words(flat))
             every = dr.arange(types.UInt32, flat.size)
 
             def pick(index: UInt32) -> Float:
@@ -101,7 +102,7 @@ class Lineariser:
 
             return pick
         kind = {"u1": types.UInt8, "f2": types.Float16, "f4": types.Float}[flat.dtype.str[1:]]
-        array = kind(flat)
+        array = from_host(kind, flat)
         return lambda index: types.Float(array if index is None else dr.gather(kind, array, index))
 
     def _scaled(self, value: Float) -> Float:

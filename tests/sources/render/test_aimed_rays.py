@@ -9,6 +9,7 @@ from rendering import mono, pair_tracer
 from scipy import stats
 
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven import retrace
@@ -222,7 +223,7 @@ def test_the_density_of_places_in_a_pixel(psf_um):
     shares = np.histogram2d(x, y, bins=(edges, edges))[0] / count
     fine = np.linspace(-1.25, 1.25, 1001)
     middle = 0.5 * (fine[1:] + fine[:-1]).astype(np.float32)
-    grid = (types.Float(values.ravel()) for values in np.meshgrid(middle, middle, indexing="ij"))
+    grid = (from_host(types.Float, values) for values in np.meshgrid(middle, middle, indexing="ij"))
     density = np.array(rays.density(*grid), np.float64).reshape(10, 100, 10, 100).mean(axis=(1, 3)) / 16
     assert np.all(np.abs(shares - density) < 5 * np.sqrt(density / count) + 2e-5)
     assert density.sum() == pytest.approx(1, abs=0.02)
@@ -235,9 +236,9 @@ def test_a_point_is_seen_where_its_ray_comes_from():
     rng = np.random.default_rng(8)
     geometry = view.sensor.spec.geometry
     row, col = (rng.uniform(n / 2 - 40, n / 2 + 40, 50).astype(np.float32) for n in (geometry.rows, geometry.cols))
-    aside = [types.Float(rng.uniform(-0.5, 0.5, 50)) for _ in range(2)]
-    origin, direction = rays.towards(types.Float(row), types.Float(col), *aside)
-    point = origin + direction * types.Float(rng.uniform(0.5, 4, 50))
+    aside = [from_host(types.Float, rng.uniform(-0.5, 0.5, 50)) for _ in range(2)]
+    origin, direction = rays.towards(from_host(types.Float, row), from_host(types.Float, col), *aside)
+    point = origin + direction * from_host(types.Float, rng.uniform(0.5, 4, 50))
     found_col, found_row, scale = rays.seen(point)
     np.testing.assert_allclose(found_col, col + np.array(aside[0]), atol=1e-3)
     np.testing.assert_allclose(found_row, row + np.array(aside[1]), atol=1e-3)

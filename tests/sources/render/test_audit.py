@@ -12,6 +12,7 @@ from scipy.stats import norm
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.describe import event_curves
 from hesim_render.mosaic.schedule import Block, tick_blocks
 from hesim_render.sources.protocol import Sample
@@ -43,7 +44,7 @@ class Given:
         types = jit()
         for block in blocks:
             for end in block.end_us[block.wanted]:
-                flux = types.Float(self.run[round(end / TICK_US) - 1][pixel].astype(np.float32))
+                flux = from_host(types.Float, self.run[round(end / TICK_US) - 1][pixel])
                 yield Sample(flux, flux, (0.001 * self.run[0]).astype(np.float32))
 
     def still_pixels(self, pixel):
@@ -386,7 +387,7 @@ class WithFrames(Given):
     def mean_flux(self, pixel, begin_us, end_us):
         types = jit()
         run = np.where(pixel % 10 == 3, 3.3e4, 3e4).astype(np.float32)
-        return types.Float(1.001 * run), types.Float(0.999 * run)
+        return from_host(types.Float, 1.001 * run), from_host(types.Float, 0.999 * run)
 
     def noise_unit(self, pixel, flux, events):
         return (UNIT if events else 2 * UNIT) * flux
@@ -669,7 +670,7 @@ class Noisy(Given):
         for block in blocks:
             for end in block.end_us[block.wanted]:
                 tick = round(end / TICK_US) - 1
-                a, b = (types.Float(half[tick][pixel].astype(np.float32)) for half in self.halves)
+                a, b = (from_host(types.Float, half[tick][pixel]) for half in self.halves)
                 yield Sample(a, b, (self.error * self.truth[tick]).astype(np.float32))
 
     def reference_flux(self, pixel, begin_us, end_us, quality, events):

@@ -6,6 +6,7 @@ import rendering
 from scipy import optimize, special, stats
 
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.blur import AiryBlur, GaussianBlur, KernelBlur, airy_radii
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
@@ -15,12 +16,14 @@ RAYS = 400_000
 def uniform(count, seed, pairs=1):
     numbers = np.random.default_rng(seed).random((2 * pairs + 1, count)).astype(np.float32)
     types = jit()
-    return [types.Float(np.minimum(values, np.float32(1 - 2**-24))) for values in numbers]
+    return [from_host(types.Float, np.minimum(values, np.float32(1 - 2**-24))) for values in numbers]
 
 
 def place_of(col, row, count):
     types = jit()
-    return types.Float(np.full(count, col, np.float32)), types.Float(np.full(count, row, np.float32))
+    return from_host(types.Float, np.full(count, col, np.float32)), from_host(
+        types.Float, np.full(count, row, np.float32)
+    )
 
 
 def test_an_airy_pattern_has_the_mtf_of_a_round_aperture():
@@ -56,7 +59,7 @@ def test_even_numbers_go_once_around_the_chief_ray(name):
     """What is even in the unit square stays so: 40 turns a fortieth apart, and Box and Muller's radius."""
     types = jit()
     parts = (np.arange(40) + 0.5) / 40
-    numbers = types.Float(np.full(40, 0.3, np.float32)), types.Float(parts.astype(np.float32))
+    numbers = from_host(types.Float, np.full(40, 0.3, np.float32)), from_host(types.Float, parts)
     if name == "Airy":
         x, y = AiryBlur(rendering.mono(lens__diffraction=True)).offset(numbers, types.Float(500.0))
     else:

@@ -10,6 +10,7 @@ from test_differences import shadow_scene
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven import event_blocks
 from hesim_render.sources.render.change_driven import pilot as pilots
@@ -280,7 +281,7 @@ def test_windows_between_looks_show_what_the_one_before_does():
     first window. Those before have that of the first, from which they do not differ.
     """
     light = light_of(s3=(4, COUNT, 300.0))
-    tracer, zeros = Detected(light), jit().Float(np.zeros(32 * SITES, np.float32))
+    tracer, zeros = Detected(light), from_host(jit().Float, np.zeros(32 * SITES, np.float32))
     own = tracer.pilot
 
     def pilot(index, window, *given, **more):
@@ -304,7 +305,7 @@ def test_windows_between_looks_show_what_the_one_before_does():
 
 def test_a_block_that_begins_with_its_anchor_takes_its_pilot():
     """Of another window, or where the pilot did not look at the whole time, the first window is traced."""
-    zeros, first = jit().Float(np.zeros(16 * SITES, np.float32)), PilotFlux.empty(SITES)
+    zeros, first = from_host(jit().Float, np.zeros(16 * SITES, np.float32)), PilotFlux.empty(SITES)
     first.controlled[:], first.plain[:], first.met[:] = 640.0, 655.0, True
     first.plain_scatter[:] = 9.0
     rays = PilotRays(zeros, zeros, 16, (0.0, 3.0))
@@ -331,7 +332,7 @@ def test_all_looks_take_the_same_scatter(mild):
         pilot_by(tracer, rays, stride=stride, mild=mild)
         assert tracer.mild == {mild}
     # with the pilot of an anchor
-    zeros = jit().Float(np.zeros(SITES * 32, np.float32))
+    zeros = from_host(jit().Float, np.zeros(SITES * 32, np.float32))
     rays, told = PilotRays(zeros, zeros, 32, (0.0, 3.0)), set()
     tracer = Detected(light_of(s3=(5, 44.0)))
 

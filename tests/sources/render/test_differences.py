@@ -10,6 +10,7 @@ from test_change_driven import fluxes, noisy
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.mosaic.schedule import tick_blocks
 from hesim_render.sources.render.change_driven import adaptive
 from hesim_render.sources.render.change_driven import pilot as pilots
@@ -326,7 +327,7 @@ class MadeUp:
         return found
 
     def pilot_rays(self, index, window, windows, rays, width_px, span_us=None, before=None, mild=False):
-        zeros = jit().Float(np.zeros(rays * index.size, np.float32))
+        zeros = from_host(jit().Float, np.zeros(rays * index.size, np.float32))
         return self.pilot(index, window, windows, rays, width_px, before=before), PilotRays(
             zeros, zeros, rays, (5.0, 6.0)
         )
@@ -351,7 +352,7 @@ def test_what_a_pilot_compares_and_between_which_looks_it_traces(width_px, reach
     tracer, (anchor, later) = MadeUp(light, near), (PilotFlux.empty(121) for _ in range(2))
     anchor.controlled[:], anchor.plain[:] = 240.0, 90.0
     later.controlled[:], later.plain[:] = 170.0, 30.0
-    zeros = jit().Float(np.zeros(16 * 121, np.float32))
+    zeros = from_host(jit().Float, np.zeros(16 * 121, np.float32))
     anchored, other = (
         Anchored(each, PilotRays(zeros, zeros, 16, (1.0, 2.0)), (-3.0, -2.0)) for each in (anchor, later)
     )

@@ -10,6 +10,7 @@ from scipy import stats
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
 from hesim_render.sources.render.change_driven.edge_share import halfplane_share, moving_share
@@ -40,7 +41,7 @@ def fitted(x, y, flux):
     """A fit to rays [pair, ray]."""
     types, found = jit(), EdgeFit.empty(len(x))
     values = x, y, np.zeros(x.shape), flux
-    found.put(slice(None), [types.Float(v.ravel().astype(np.float32)) for v in values], x.shape[1])
+    found.put(slice(None), [from_host(types.Float, v) for v in values], x.shape[1])
     return found
 
 
@@ -361,7 +362,7 @@ def test_the_moving_line_is_found():
     distance = a[:, None] * x + b[:, None] * y + 0.4 * c[:, None] + v[:, None] * time
     found = EdgeFit.empty(300)
     flux, types = np.where(distance > 0, 830.0, 270.0), jit()
-    values = [types.Float(each.ravel().astype(np.float32)) for each in (x, y, time, flux)]
+    values = [from_host(types.Float, each) for each in (x, y, time, flux)]
     found.put(slice(None), values, rays, moves=True)
     own = (found.normal_x[:, None] * x + found.normal_y[:, None] * y + found.offset[:, None]
            + found.speed[:, None] * time)  # fmt: skip
@@ -381,7 +382,7 @@ def test_a_flash_is_seldom_a_line():
     x, y, time = rng.random((3, 20, 64)) - 0.5
     found, types = EdgeFit.empty(20), jit()
     flux = np.where(time > 0.1 + 0.02 * x, 830.0, 270.0)
-    found.put(slice(None), [types.Float(v.ravel().astype(np.float32)) for v in (x, y, time, flux)], 64, moves=True)
+    found.put(slice(None), [from_host(types.Float, v) for v in (x, y, time, flux)], 64, moves=True)
     assert found.is_line.mean() < 0.4 and np.abs(found.speed[found.is_line]).max(initial=0) <= 8
 
 
@@ -398,7 +399,7 @@ def test_rays_of_a_strip_have_their_density(speed):
 
     def placed(is_strip):
         filled = {name: dr.full(types.Float, value, count) for name, value in model.items()}
-        given = [types.Float(v.astype(np.float32)) for v in rng.random((5, count))]
+        given = [from_host(types.Float, v) for v in rng.random((5, count))]
         lanes = LaneEdges(**filled, is_strip=dr.full(types.Bool, is_strip, count))
         out = lanes.place((given[0] - 0.5, given[1] - 0.5), (given[2], given[3]), given[4])
         return [np.array(v, np.float64) for v in out], np.array(given[4])

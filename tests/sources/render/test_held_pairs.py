@@ -10,6 +10,7 @@ from rendering import make_scene
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.render.change_driven import adaptive
@@ -184,7 +185,7 @@ def test_pixels_whose_rays_all_see_the_same_have_one_level():
     levels = np.repeat([800.0, 805.0, 300.0, 0.0], 4).astype(np.float32)
     x, y = np.random.default_rng(2).uniform(-0.7, 0.7, (2, levels.size)).astype(np.float32)
     fit = EdgeFit.empty(4)
-    fit.put(slice(0, 4), [*(types.Float(each) for each in (x, y, 0 * x, levels))], 4)
+    fit.put(slice(0, 4), [*(from_host(types.Float, each) for each in (x, y, 0 * x, levels))], 4)
     flat = [{each.name: getattr(fit, each.name)[number] for each in fields(EdgeFit)} for number in range(4)]
     assert two(flat[0], flat[1]) and two(flat[1], flat[0]) and two(flat[3], flat[3])
     for first, second in ((0, 2), (2, 0), (0, 3), (3, 0)):

@@ -11,6 +11,7 @@ from scipy.special import j1
 import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.recording.manifest import build
 from hesim_render.sources.render import RenderedFlux
 from hesim_render.sources.render.camera import place_camera
@@ -122,7 +123,7 @@ def test_colours_at_the_ends_of_the_spectrum_have_their_own_size(end):
     place = types.Float(3.0), types.Float(2.0)
     middle = types.Float(0.5), types.Float(0.5)
     plain = rays.towards(place[1], place[0], *middle)[1].numpy().reshape(3)
-    _, direction, _ = rays.through_lens(place, middle, None, types.Float(asked))
+    _, direction, _ = rays.through_lens(place, middle, None, from_host(types.Float, asked))
     found = direction.numpy().reshape(3, 2)
     slope = found[:2] / found[2]
     factor = 1 + larger[3 * end] * np.array([1, 0.5])

@@ -5,6 +5,7 @@ import pytest
 from rendering import make_scene, mono
 
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.light_times import LightTimes
@@ -28,9 +29,9 @@ def test_instants_have_the_density_of_the_power(name):
     begin = np.array([0.0, 3333, 5e7 + 17, -500, 600, 10, 1000.2])
     end = np.array([1e4, 3400, 5e7 + 2017, 1200, 601, 10, 1000.3])
     times, count = LightTimes.of(waveform, begin, end), 20_001
-    share = types.Float((np.arange(count) + 0.5) / count)
+    share = from_host(types.Float, (np.arange(count) + 0.5) / count)
     for k, (low, high) in enumerate(zip(begin, end, strict=True)):
-        instant = np.array(times.instant_us(types.UInt32(np.full(count, k)), share), np.float64)
+        instant = np.array(times.instant_us(from_host(types.UInt32, np.full(count, k)), share), np.float64)
         assert instant.min() >= 0 and instant.max() <= (high - low) * (1 + 1e-6)
         assert np.diff(instant).min() >= -1e-5 * (high - low)
         if high == low:

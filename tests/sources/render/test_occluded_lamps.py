@@ -9,6 +9,7 @@ from rendering import make_scene, mono, pair_tracer
 
 import hesim_render as hr
 from hesim_render.core.device import dr
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven import decision_rays
 from hesim_render.sources.render.change_driven.known_shadows import with_known_shadows
@@ -104,7 +105,9 @@ def before(code, points, normals, seed=4):
     drawn, share = lamp.sample(point, normal, place)
     ray = mi.Ray3f(point, dr.normalize(drawn - point))
     ray.maxt = dr.norm(drawn - point) * (1 - 1e-4)
-    hidden, count = shadows().before(lamp, normal, ray, None, mi.UInt32(np.full(len(points), code, np.uint32)))
+    hidden, count = shadows().before(
+        lamp, normal, ray, None, from_host(mi.UInt32, np.full(len(points), code, np.uint32))
+    )
     return np.array(hidden), np.array(count), np.array(share)
 
 

@@ -5,6 +5,7 @@ import pytest
 from scipy.ndimage import maximum_filter
 
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.change_driven.neighbours import Lattice, Sites
 from hesim_render.sources.render.change_driven.ray_statistics import RayStatistics
 
@@ -51,11 +52,11 @@ def test_statistics_of_the_rays_of_pairs(alike, mild):
     bits[1] = 0
     statistics = RayStatistics(pairs, rays, alike)
     means, met, estimates, changes = statistics.of(
-        [types.Float(third.ravel())],
-        types.UInt32(bits.ravel()),
-        [types.Float(one.ravel()), types.Float(other.ravel())],
-        [types.Float(each.ravel()) for each in before],
-        types.UInt32(order.astype(np.uint32) * rays),
+        [from_host(types.Float, third)],
+        from_host(types.UInt32, bits),
+        [from_host(types.Float, one), from_host(types.Float, other)],
+        [from_host(types.Float, each) for each in before],
+        from_host(types.UInt32, order.astype(np.uint32) * rays),
         mild,
     )
     np.testing.assert_allclose(np.array(means[0]), third.mean(axis=1), rtol=1e-5)
@@ -74,8 +75,10 @@ def test_statistics_of_the_rays_of_pairs(alike, mild):
 
 def test_without_rays_to_compare_with_there_are_no_changes():
     types = jit()
-    values = types.Float(np.arange(16, dtype=np.float32))
-    means, met, estimates, changes = RayStatistics(2, 8, 8).of([], types.UInt32(np.zeros(16, np.uint32)), [values])
+    values = from_host(types.Float, np.arange(16, dtype=np.float32))
+    means, met, estimates, changes = RayStatistics(2, 8, 8).of(
+        [], from_host(types.UInt32, np.zeros(16, np.uint32)), [values]
+    )
     assert (means, changes) == ([], [])
     np.testing.assert_array_equal(np.array(met), [0, 0])
     np.testing.assert_allclose(np.array(estimates[0][0]), [3.5, 11.5], rtol=1e-6)

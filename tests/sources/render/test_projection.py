@@ -7,6 +7,7 @@ import rendering
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.primary_rays import RayFactory
 
@@ -49,7 +50,7 @@ def test_rays_of_the_renderer_leave_through_their_places_to_a_thousandth_of_a_pi
     rng = np.random.default_rng(2)
     row, col = (rng.integers(0, count, 20_000) for count in (2448, 3264))
     aperture = rng.random((2, row.size)).astype(np.float32)
-    lanes = [types.Float(values.astype(np.float32)) for values in (row, col, *aperture)]
+    lanes = [from_host(types.Float, values) for values in (row, col, *aperture)]
     origin, direction = RayFactory(view).rays(lanes[0], lanes[1], (lanes[2], lanes[3]), None)
     local = np.array(direction, np.float64).T @ view.camera_to_world[:3, :3]
     np.testing.assert_allclose(np.array(origin).ravel(), view.camera_to_world[:3, 3], rtol=1e-6)
@@ -86,7 +87,7 @@ def test_a_lens_with_distortion_is_opencvs_both_ways_and_on_the_device(name):
     types, rng = jit(), np.random.default_rng(2)
     row, col = (rng.integers(0, count, 20_000) for count in (2448, 3264))
     aperture = rng.random((2, row.size)).astype(np.float32)
-    lanes = [types.Float(values.astype(np.float32)) for values in (row, col, *aperture)]
+    lanes = [from_host(types.Float, values) for values in (row, col, *aperture)]
     factory = RayFactory(view)
     origin, direction = factory.rays(lanes[0], lanes[1], (lanes[2], lanes[3]), None)
     way = np.array(direction, np.float64).T @ view.camera_to_world[:3, :3]
@@ -101,7 +102,7 @@ def test_a_lens_with_distortion_is_opencvs_both_ways_and_on_the_device(name):
         for radius in (limit, 1.4 * limit, 9 * limit):
             away = np.stack([radius * np.cos(around), radius * np.sin(around), -np.ones(5)], axis=-1)
             points = 2.3 * away @ view.camera_to_world[:3, :3].T + view.camera_to_world[:3, 3]
-            point = types.Array3f(*(types.Float(side.astype(np.float32)) for side in points.T))
+            point = types.Array3f(*(from_host(types.Float, side) for side in points.T))
             seen.append(np.stack([np.array(place) for place in factory.seen(point)[:2]], axis=-1))
         np.testing.assert_allclose(seen[1:], [seen[0]] * 2, atol=0.05)
 

@@ -5,6 +5,7 @@ import pytest
 from rendering import flux_image, mitsuba_scene, mono, pair_tracer
 from rendering import traced as traced_pairs
 
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.transport import paths
 from hesim_render.sources.render.transport.mirrored_lamps import Cones, LampImages
@@ -138,10 +139,13 @@ def test_directions_are_drawn_with_their_density():
     axes = (np.array([0.0, 0, 1]), tilt)
     cones = Cones(
         mi,
-        [(mi.Vector3f(a), mi.Float(w), mi.Float(c)) for a, w, c in zip(axes, widths, chances, strict=True)],
+        [
+            (mi.Vector3f(a), from_host(mi.Float, w), from_host(mi.Float, c))
+            for a, w, c in zip(axes, widths, chances, strict=True)
+        ],
     )
     rng = np.random.default_rng(4)
-    uniform = mi.Float(rng.random(count, np.float32))
+    uniform = from_host(mi.Float, rng.random(count, np.float32))
     direction, drawn = cones.sample(uniform, mi.Point2f(rng.random((2, count), np.float32)))
     drawn, direction = np.array(drawn), np.array(direction).T
     choice = np.array(uniform)

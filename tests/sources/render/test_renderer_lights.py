@@ -7,6 +7,7 @@ from scipy import integrate
 
 import hesim_render as hr
 from hesim_render.core.errors import SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render import render_cube
 from hesim_render.sources.render.scene.lights import (
     area_light_frame,
@@ -118,7 +119,7 @@ def test_an_evenly_spaced_spectrum_is_the_same_looked_up_faster():
             si = mi.SurfaceInteraction3f()
             values = []
             for wavelengths in (inside, outside):
-                si.wavelengths = mi.UnpolarizedSpectrum(mi.Float(wavelengths.astype(np.float32)))
+                si.wavelengths = mi.UnpolarizedSpectrum(from_host(mi.Float, wavelengths))
                 values.append(np.array(texture.eval(si))[0])
             assert np.all(values[1] == 0)
             seen.append(values[0])

@@ -9,6 +9,7 @@ from rendering import mono, pair_tracer, traced
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux, PilotRays
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -64,8 +65,8 @@ def test_balls_rule_out_no_ray_that_meets_what_is_in_them():
     root = np.sqrt(np.maximum(along**2 - rest, 0))
     meets = (along**2 > rest) & (-along - root < length) & (-along + root > 0)
     ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*direction.T))
-    ball = mi.Point3f(middle), mi.Float((1.0001 * radius) ** 2)
-    found = np.array(meets_ball(ray, mi.Float(length), ball))
+    ball = mi.Point3f(middle), from_host(mi.Float, (1.0001 * radius) ** 2)
+    found = np.array(meets_ball(ray, from_host(mi.Float, length), ball))
     assert 0.1 < meets.mean() < 0.6
     assert not np.any(meets & ~found)
     assert np.mean(found & ~meets) < 0.05  # rays that end within a radius before it
@@ -180,8 +181,8 @@ def test_the_scatter_of_a_pilot_has_no_range(power, mild):
     types, rng = jit(), np.random.default_rng(3)
     two_kinds, one_bright = np.repeat([5.0, 3.0], 16) + rng.normal(size=32), np.where(np.arange(32) == 7, 900.0, 0.25)
     rays = np.stack([two_kinds, one_bright])
-    flux = types.Float(np.ldexp(rays, power).ravel().astype(np.float32))
-    met = types.UInt32((np.arange(64) == 53).astype(np.uint32))  # a single ray of the second pair
+    flux = from_host(types.Float, np.ldexp(rays, power))
+    met = from_host(types.UInt32, np.arange(64) == 53)  # a single ray of the second pair
     out = PilotFlux.empty(2)
     with np.errstate(all="raise"):
         out.put(slice(0, 2), flux, 2 * flux, 3 * flux, met, 32, 16, mild=mild)
@@ -201,16 +202,24 @@ def test_a_pilot_says_how_much_single_rays_change():
     types, rng = jit(), np.random.default_rng(4)
     now, before = 7e4 + 900 * rng.normal(size=(2, 3, 16))
     before[1] = now[1] - 350  # all rays alike: the mean changes, and nothing scatters
-    fluxes = [types.Float(values.ravel().astype(np.float32)) for values in (now, 0.5 * now, before, 0.3 * before)]
+    fluxes = [from_host(types.Float, values) for values in (now, 0.5 * now, before, 0.3 * before)]
     rays, out = PilotRays(fluxes[2], fluxes[3], 16, (0.0, 1.0)), PilotFlux.empty(2)
     pairs = np.array([2, 0])
-    some = [types.Float(np.array(values).reshape(3, 16)[pairs].ravel()) for values in fluxes[:2]]
-    met = types.UInt32(np.zeros(32, np.uint32))
+    some = [from_host(types.Float, np.array(values).reshape(3, 16)[pairs]) for values in fluxes[:2]]
+    met = from_host(types.UInt32, np.zeros(32, np.uint32))
     out.put(slice(0, 2), *some, some[0], met, 16, 16, (rays, pairs))
     for found, difference in ((out.controlled_change, now - before), (out.plain_change, 0.5 * now - 0.3 * before)):
         np.testing.assert_allclose(found, difference[pairs].std(axis=1, ddof=1), rtol=1e-4)
     every = PilotFlux.empty(3)
-    every.put(slice(0, 3), *fluxes[:2], fluxes[0], types.UInt32(np.zeros(48, np.uint32)), 16, 16, (rays, np.arange(3)))
+    every.put(
+        slice(0, 3),
+        *fluxes[:2],
+        fluxes[0],
+        from_host(types.UInt32, np.zeros(48, np.uint32)),
+        16,
+        16,
+        (rays, np.arange(3)),
+    )
     assert every.controlled_change[1] < 0.05 and every.controlled_change[0] > 500
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from rendering import mitsuba_scene, mono, pair_tracer, traced
 
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.transport import closed_form as parts
 from hesim_render.sources.render.transport import moving_scene as moving
@@ -49,7 +50,7 @@ def rays():
     direction = -origin + rng.normal(size=(3, COUNT)) * 0.3
     direction /= np.linalg.norm(direction, axis=0)
     ray = mi.Ray3f(mi.Point3f(origin.astype(np.float32)), mi.Vector3f(direction.astype(np.float32)))
-    ray.maxt = mi.Float(rng.choice([np.inf, 0.7], COUNT).astype(np.float32))
+    ray.maxt = from_host(mi.Float, rng.choice([np.inf, 0.7], COUNT))
     return ray
 
 
@@ -154,7 +155,7 @@ def test_a_few_balls_beside_other_shapes_are_met_in_closed_form(balls, apart):
     for told, known in [(ours.t, theirs.t), (ours.p, theirs.p), (ours.n, theirs.n), (ours.wi, theirs.wi)]:
         off = np.abs(np.array(told)[..., same] - np.array(known)[..., same])
         assert np.mean(off < 2e-4) > 0.9995
-    asked = mi.Bool(np.arange(COUNT) % 3 != 1)
+    asked = from_host(mi.Bool, np.arange(COUNT) % 3 != 1)
     blocked = np.array(part.blocks(ray, asked))
     assert np.mean(blocked == np.array(scene.ray_test(ray, asked))) > 0.9999
     np.testing.assert_array_equal(np.array(part.nearest(ray, False, asked)[0].is_valid()), met & np.array(asked))
@@ -177,7 +178,7 @@ def test_balls_beside_instances_are_left_to_mitsuba():
 def test_masked_lanes_meet_nothing():
     mi = mitsuba()
     part = Part(mi, scene_of(*BOXES["all together"]()), apart=False)
-    asked = mi.Bool(np.arange(COUNT) % 2 == 0)
+    asked = from_host(mi.Bool, np.arange(COUNT) % 2 == 0)
     hit, face = part.nearest(rays(), False, asked)
     for found in (hit.is_valid(), face != 0, part.blocks(rays(), asked)):
         assert np.array(found)[::2].any()

@@ -6,6 +6,7 @@ import pytest
 from scipy import stats
 
 from hesim_render.core.backend import jit
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.sampling.sampler import (
     permute,
     sampler_class,
@@ -23,7 +24,7 @@ def started(pixels, per_half, seed=11):
     mi = mitsuba()
     index = np.indices((pixels, 2, per_half)).reshape(3, -1).astype(np.uint32)
     sampler = sampler_class(mi.variant())()
-    sampler.setup(mi.UInt64(seed), *(mi.UInt32(i) for i in index), per_half)
+    sampler.setup(from_host(mi.UInt64, seed), *(from_host(mi.UInt32, i) for i in index), per_half)
     return sampler
 
 
@@ -78,7 +79,9 @@ def test_place_and_direction_fill_all_boxes(bits):
     types, count, t = jit(), 1 << bits, 3 if bits == 10 else 2
     numbers = np.arange(count, dtype=np.uint32), surface_points()[:count]
     np.testing.assert_array_equal(np.sort(numbers[1]), numbers[0])
-    pairs = [np.array(v, dtype=np.float64) / 2**32 for each in numbers for v in zero_two_point(types.UInt32(each))]
+    pairs = [
+        np.array(v, dtype=np.float64) / 2**32 for each in numbers for v in zero_two_point(from_host(types.UInt32, each))
+    ]
     points = np.stack(pairs, axis=1)[None]
     total, splits = bits - t, range(bits - t + 1)
     for i, j, k in ((i, j, k) for i in splits for j in splits for k in splits if i + j + k <= total):
@@ -243,7 +246,7 @@ def test_wavelengths_follow_the_response_exactly():
     flat = Spectrum(np.array([380.0, 780.0]), np.array([2.0, 2.0]))
     sampler = WavelengthSampler({"flat": flat, "spiky": spiky})
     count = 1 << 16
-    u = types.Float(((np.arange(count) + 0.5) / count).astype(np.float32))
+    u = from_host(types.Float, (np.arange(count) + 0.5) / count)
     for number, response in enumerate((flat, spiky)):
         which = dr.full(types.UInt32, number, count)
         np.testing.assert_allclose(np.array(sampler.total(which))[0], response.integral(), rtol=1e-6)

@@ -10,6 +10,7 @@ from scipy import stats
 import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.primary_rays import RayFactory
@@ -211,7 +212,7 @@ class Given:
     """A sampler with known numbers."""
 
     def __init__(self, u, v):
-        self._pair = jit().Float(u), jit().Float(v)
+        self._pair = from_host(jit().Float, u), from_host(jit().Float, v)
 
     def next_2d(self):
         return self._pair
@@ -225,7 +226,7 @@ def test_rays_leave_the_pupil_through_the_plane_in_focus_with_the_cosine_of_thei
     view = place_camera(furnace(0.2).spec, sensor)
     rng = np.random.default_rng(4)
     u, v, col, row = rng.random(500), rng.random(500), rng.uniform(0, 1023, 500), rng.uniform(0, 1023, 500)
-    lanes = [jit().Float(values.astype(np.float32)) for values in (col, row)]
+    lanes = [from_host(jit().Float, values) for values in (col, row)]
     zero = jit().Float(0)
     origin, direction, weight = RayFactory(view).through_lens(
         tuple(lanes), (zero, zero), Given(u.astype(np.float32), v.astype(np.float32))

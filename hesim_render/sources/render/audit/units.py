@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Halves
+from hesim_render.core.host_arrays import from_host
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.protocol import FluxSource, Sample
 
@@ -252,6 +253,6 @@ class NotedFlux:
 def _mean_and_difference(halves: Halves, place: NDArray[np.int64]) -> NDArray[np.float64]:
     """Mean and half the difference of both halves at some places, [2, k]."""
     types = jit()
-    index = types.UInt32(place.astype(np.uint32))
+    index = from_host(types.UInt32, place)
     one, other = (np.array(dr.gather(types.Float, half, index), np.float64) for half in halves)
     return np.stack([one + other, one - other]) / 2

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, UInt32
-from hesim_render.core.tables import spread_out, table
+from hesim_render.core.host_arrays import from_host, spread_out
 from hesim_render.sources.render.change_driven.edges import PairEdges
 from hesim_render.sources.render.primary_rays import RayFactory
 from hesim_render.sources.render.scene.tracks import DevicePose
@@ -173,7 +173,7 @@ class LaneAims:
         """
         types = jit()
         first, count = (spread_out(types.UInt32, values, pair) for values in (aims.first, aims.count))
-        group = table(types.UInt32, np.append(aims.group, np.zeros(2, np.uint32)))
+        group = from_host(types.UInt32, np.append(aims.group, np.zeros(2, np.uint32)))
         return cls(first, count, group, is_aimed)
 
 
@@ -207,7 +207,7 @@ class Aim:
 
     def __init__(self, parts: MovingScene, rays: RayFactory) -> None:
         self._parts, self._rays = parts, rays
-        self._balls = table(jit().Float, np.array([ball_around(group) for group in parts.groups] or [(0.0,) * 4]))
+        self._balls = from_host(jit().Float, np.array([ball_around(group) for group in parts.groups] or [(0.0,) * 4]))
         dr.make_opaque(self._balls)
 
     def choose(self, lanes: LaneAims, moment: Float) -> tuple[UInt32, Float]:

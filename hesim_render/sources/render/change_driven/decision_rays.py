@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt64
+from hesim_render.core.host_arrays import spread_out
 from hesim_render.core.rng import Stream
-from hesim_render.core.tables import spread_out
 from hesim_render.sources.render.change_driven.aim import in_blocks
 from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges, joined_rays
 from hesim_render.sources.render.change_driven.packet_tracer import PACKET, PacketTracer, pair_of_rays

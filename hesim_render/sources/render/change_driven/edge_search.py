@@ -8,7 +8,7 @@ import numpy as np
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 
 #: Directions of a line that are tried in a round, about the best one so far; the angle that they span in the first
 #: round, how many times less in each further one, and rounds.
@@ -128,7 +128,7 @@ def widest_moving_gap(
     """
     types = jit()
     projected = _Projected(x, y, time, side, rays)
-    steps = table(types.Float, np.tan(np.deg2rad(np.array(_STEPS_DEG, np.float32))))
+    steps = from_host(types.Float, np.tan(np.deg2rad(np.array(_STEPS_DEG, np.float32))))
     dr.make_opaque(steps)
     turns = 2 * math.pi / _AROUND
 

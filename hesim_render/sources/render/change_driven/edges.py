@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, UInt32
-from hesim_render.core.tables import spread_out
+from hesim_render.core.host_arrays import spread_out
 from hesim_render.sources.render.change_driven.edge_search import widest_gap, widest_moving_gap
 from hesim_render.sources.render.change_driven.edge_share import LEAST_SPEED, moving_share
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Halves
 from hesim_render.core.errors import RangeError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress
 from hesim_render.mosaic.schedule import Block, blocks_of_run
@@ -174,7 +175,7 @@ class ChangeDrivenFlux:
         flux = Flux.zeros(1, pixels.size)
         if not self._is_dark and pixels.size:
             self._renderer.alone(pixels, begin, end, "any", flux)
-        half_a, half_b = types.Float(flux.half_a[0]), types.Float(flux.half_b[0])
+        half_a, half_b = from_host(types.Float, flux.half_a[0]), from_host(types.Float, flux.half_b[0])
         require_finite(half_a, half_b, self._scene, self.sensor.layout, pixels)
         return half_a, half_b
 
@@ -252,6 +253,6 @@ class ChangeDrivenFlux:
                 values = [part[0].copy() for part in base.arrays]
                 for whole, part in zip(values, flux.at(int(window)).arrays, strict=True):
                     whole[alive] = part[0, own]
-                half_a, half_b = types.Float(values[0]), types.Float(values[1])
+                half_a, half_b = from_host(types.Float, values[0]), from_host(types.Float, values[1])
                 require_finite(half_a, half_b, self._scene, self.sensor.layout, pixels)
                 yield Sample(half_a, half_b, values[2])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.spectral.waveform import Waveform
 
 
@@ -95,9 +95,9 @@ class LightTimes:
         parts, types = LightParts.of(waveform, begin_us, end_us), jit()
         rows = np.stack([parts.energy_before, parts.energy, parts.begin_us, parts.length_us], axis=1)
         # padded, because a table of one entry becomes a constant in the kernel
-        numbers = [table(types.UInt32, np.append(values, values[-1:])) for values in (parts.first, parts.last)]
+        numbers = [from_host(types.UInt32, np.append(values, values[-1:])) for values in (parts.first, parts.last)]
         tables = [
-            table(types.Float, np.append(values.ravel(), np.zeros(8)).astype(np.float32))
+            from_host(types.Float, np.append(values.ravel(), np.zeros(8)).astype(np.float32))
             for values in (parts.energy_before + parts.energy, rows, parts.tilt)
         ]
         dr.make_opaque(numbers, tables)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Ray, UInt32, UInt64
+from hesim_render.core.host_arrays import from_host, spread_out
 from hesim_render.core.method_cache import method_cache
 from hesim_render.core.rng import Stream, stream_key
-from hesim_render.core.tables import spread_out, table
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.change_driven.aim import Aim, LaneAims, PairAims
@@ -137,7 +137,7 @@ class PacketTracer(Tracer):
         self._boxes = method_cache(self.parts.box_rows_in, maxsize=8)
         layout = self.sensor.layout
         tile = np.array(layout.filter_index[: layout.tile_shape[0], : layout.tile_shape[1]], np.uint32)
-        self._filter_tile = types.UInt32(tile.ravel())
+        self._filter_tile = from_host(types.UInt32, tile)
         self._tile_rows, self._tile_cols = (dr.opaque(types.UInt32, count) for count in layout.tile_shape)
         dr.make_opaque(self._filter_tile)
 
@@ -236,7 +236,7 @@ class PacketTracer(Tracer):
         # the first ray of each pair, and what the pair has, side by side, so that one fetch brings them
         pixel_of, window_of, repeat_of = lanes
         columns = (np.cumsum(packets) - packets) * PACKET, pixel_of, window_of, half_rays
-        heads = table(types.UInt32, np.stack(columns, axis=1).astype(np.uint32))
+        heads = from_host(types.UInt32, np.stack(columns, axis=1).astype(np.uint32))
         start, pixel, window, per_half = dr.gather(types.Array4u, heads, pair)
         sample = ray_index - start
         half = dr.select(sample >= per_half, types.UInt32(1), types.UInt32(0))

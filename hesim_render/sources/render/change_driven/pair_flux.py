@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.journal import Journal, key_of
 from hesim_render.sources.render.change_driven.aim import PairAims
 from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
@@ -152,7 +153,7 @@ class PilotFlux:
         first = None
         if before is not None:
             others = before[0].controlled, before[0].plain
-            first = types.UInt32(before[1].astype(np.uint32)) * dr.opaque(types.UInt32, samples)
+            first = from_host(types.UInt32, before[1]) * dr.opaque(types.UInt32, samples)
         # both estimators from the same rays; the plan chooses by their scatter
         means, bits, both, changes = rays.of([unshadowed], met, [controlled, plain], others, first, mild)
         results: dict[str, Float | UInt32] = {"unshadowed": means[0], "met": bits}

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt64
+from hesim_render.core.host_arrays import spread_out
 from hesim_render.core.rng import Stream
-from hesim_render.core.tables import spread_out
 from hesim_render.sources.render.change_driven.aim import PairAims, in_blocks
 from hesim_render.sources.render.change_driven.decision_rays import DecisionRays
 from hesim_render.sources.render.change_driven.edges import PairEdges

@@ -4,6 +4,7 @@ import numpy as np
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 
@@ -24,7 +25,7 @@ def least_depth_m(tracer: PairTracer, t_us: float) -> float:
     pitch_mm = geometry.pitch_um * 1e-3
     row = np.repeat(y / pitch_mm + (geometry.rows - 1) / 2, _COLS)
     col = np.tile(x / pitch_mm + (geometry.cols - 1) / 2, _ROWS)
-    rows, cols = (types.Float(values.astype(np.float32)) for values in (row, col))
+    rows, cols = (from_host(types.Float, values) for values in (row, col))
     origin, direction = tracer.rays.towards(rows, cols, types.Float(0), types.Float(0))
     axis = -view.camera_to_world[:3, 2]
     if tracer.camera is not None:

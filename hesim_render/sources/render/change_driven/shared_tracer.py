@@ -15,8 +15,8 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import UInt64
 from hesim_render.core.distinct import distinct_columns
+from hesim_render.core.host_arrays import spread_out
 from hesim_render.core.rng import Stream
-from hesim_render.core.tables import spread_out
 from hesim_render.sources.render.change_driven.neighbours import Lattice
 from hesim_render.sources.render.change_driven.packet_tracer import PACKET, pair_of_rays
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, flux_inputs, remembered

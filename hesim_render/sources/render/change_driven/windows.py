@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, UInt32
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.change_driven.light_times import LightTimes
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.swept_boxes import Moment
@@ -105,14 +105,14 @@ class Moments:
         boxes = boxes_of(spans)
         # padded, because a table of one entry becomes a constant in the kernel, and boxes are fetched four at a time
         lengths, local, sides = (
-            table(types.Float, np.append(values.astype(np.float32).ravel(), np.zeros(8, np.float32)))
+            from_host(types.Float, np.append(values.astype(np.float32).ravel(), np.zeros(8, np.float32)))
             for values in (
                 windows.end_us - windows.begin_us,
                 np.stack(times, axis=1) if times else np.empty(0),
                 boxes,
             )
         )
-        numbers = types.UInt32(np.append(bins, bins[-1:]))
+        numbers = from_host(types.UInt32, np.append(bins, bins[-1:]))
         light = None if waveform is None else LightTimes.of(waveform, windows.begin_us, windows.end_us)
         moments = cls(lengths, local, sides, numbers, len(tracks), boxes.shape[1], light)
         dr.make_opaque(moments.length_us, moments.times, moments.boxes, moments.bins)

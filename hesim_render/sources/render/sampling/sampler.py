@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, MitsubaModule, MitsubaObject, Point2, UInt32, UInt64
+from hesim_render.core.host_arrays import from_host
 
 #: Number of index bits that one table of the third generator matrix covers.
 _TABLE_BITS = 11
@@ -124,8 +125,8 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
 
         def __init__(self, props: MitsubaObject = None) -> None:
             super().__init__(props if props is not None else mi.Properties())
-            self._tables = [mi.UInt32(third_coordinates(first, _TABLE_BITS)) for first in (0, _TABLE_BITS)]
-            self._surface_points = mi.UInt32(surface_points())
+            self._tables = [from_host(mi.UInt32, third_coordinates(first, _TABLE_BITS)) for first in (0, _TABLE_BITS)]
+            self._surface_points = from_host(mi.UInt32, surface_points())
             dr.make_opaque(*self._tables, self._surface_points)
             self.rest()
 

@@ -9,7 +9,7 @@ import numpy as np
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, UInt32
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.spectral.spectrum import Spectrum
 
 #: Parts of a response's integral with a tabulated first cell. Few parts contain more than one end of a cell.
@@ -51,10 +51,10 @@ class WavelengthSampler:
             totals.append(area[-1])
         self._room = room - 1
         self._cells, self._shares, self._totals = (
-            table(types.Float, values.astype(np.float32))
+            from_host(types.Float, values)
             for values in (np.concatenate(cells), np.concatenate(shares), np.array(totals))
         )
-        self._starts = table(types.UInt32, np.concatenate(starts).astype(np.uint32))
+        self._starts = from_host(types.UInt32, np.concatenate(starts))
         dr.make_opaque(self._cells, self._shares, self._totals, self._starts)
 
     def total(self, filter_index: UInt32) -> Float:

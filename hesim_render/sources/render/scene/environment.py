@@ -9,6 +9,7 @@ from hesim_render.core.device import dr
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, files_readable, transform
 from hesim_render.sources.render.scene.sizes import require_fits
@@ -108,7 +109,7 @@ def level_on_plane(
         if seen.size == 0:
             continue
         si = dr.zeros(mi.SurfaceInteraction3f, seen.size)
-        si.wi = mi.Vector3f(*(-each[seen].astype(np.float32) for each in direction))
+        si.wi = mi.Vector3f(*(from_host(mi.Float, -each[seen]) for each in direction))
         level = dr.zeros(mi.Float, seen.size)
         # one kernel for all groups of four wavelengths, which leaves their sum on the device
         for wavelengths, weights in zip(_WAVELENGTH_NM.reshape(-1, 4), weight_nm.reshape(-1, 4), strict=True):

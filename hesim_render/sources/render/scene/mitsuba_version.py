@@ -18,6 +18,7 @@ from hesim_render.core.child import interrupts_held
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.vertex_normals import ordered_normals
 from hesim_render.spectral.spectrum import Spectrum
 
@@ -133,10 +134,11 @@ def make_mesh(
         properties["emitter"] = mi.load_dict(emitter)
     mesh = mi.Mesh(name, len(vertices), len(faces), has_vertex_texcoords=texcoords is not None, props=properties)
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = np.ascontiguousarray(vertices, dtype=np.float32).ravel()
-    parameters["faces"] = np.ascontiguousarray(faces, dtype=np.uint32).ravel()
+    given: dict[str, NDArray] = {"vertex_positions": vertices, "faces": faces}
     if texcoords is not None:
-        parameters["vertex_texcoords"] = np.ascontiguousarray(texcoords, dtype=np.float32).ravel()
+        given["vertex_texcoords"] = texcoords
+    for key, values in given.items():
+        parameters[key] = from_host(type(parameters[key]), values)
     parameters.update()
     return mesh
 

@@ -8,6 +8,7 @@ import numpy as np
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Interaction, Mask, MitsubaModule
 from hesim_render.core.errors import SpecError
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.mitsuba_version import transform
 from hesim_render.targets.piece import Picture
 
@@ -60,8 +61,8 @@ def _spectral_texture(variant: str) -> type:
             assert picture.wavelength_nm is not None
             rows, cols, planes = picture.values.shape
             self._size, self._planes = (mi.UInt32(rows), mi.UInt32(cols)), planes
-            self._values = mi.Float(np.ascontiguousarray(picture.values, dtype=np.float32).ravel())
-            self._knots = mi.Float(picture.wavelength_nm.astype(np.float32))
+            self._values = from_host(mi.Float, picture.values)
+            self._knots = from_host(mi.Float, picture.wavelength_nm)
             self._ends = mi.Float(float(picture.wavelength_nm[0])), mi.Float(float(picture.wavelength_nm[-1]))
             self._bilinear = picture.interpolation == "bilinear"
             self._repeats = repeat is not None

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, Point3, UInt32, Vector3
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 
 if TYPE_CHECKING:
     from hesim_render.sources.render.scene.trajectory import Trajectory
@@ -92,14 +92,14 @@ class Tracks:
             rows.append(np.hstack(columns))
             times.append(knots)
         self._heads, self._rows, self._times = (
-            table(types.Float, np.concatenate(values).astype(np.float32)) for values in (heads, rows, times)
+            from_host(types.Float, np.concatenate(values)) for values in (heads, rows, times)
         )
         #: Cells of equal length of each track, two for each segment, of which a table has the first segment.
         self._cells = 2 << max(0, max(map(len, rows)) - 1).bit_length()
         # what rounding may move a time by, in cells
         margin = max(0.01, 2.0**-22 * self._cells)
         first, last = (np.stack([self._segments(knots, shift) for knots in times]) for shift in (-margin, 1 + margin))
-        self._first = types.UInt32(first.astype(np.uint32).ravel())
+        self._first = from_host(types.UInt32, first)
         #: Largest number of segments that begin in a cell; rounded so that similar tracks share a kernel.
         self._most = (1 << int((last - first).max()).bit_length()) - 1
         dr.make_opaque(self._heads, self._rows, self._times, self._first)

@@ -35,7 +35,7 @@ from hesim_render.core.device_types import (
     UInt32,
     Vector3,
 )
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene import lights
 from hesim_render.sources.render.scene.surfaces import Paint
 from hesim_render.sources.render.transport.irradiance import RectangleLight
@@ -136,9 +136,9 @@ class DiffuseIntegrator:
             for level in irradiances
         ]
         emitted = [[integrate_product(r, strength) for r in responses] for strength in strengths]
-        self._rows = table(mi.Float, rows_of.astype(np.float32))
-        self._reflected = mi.Float(np.array(reflected or [[[0.0]]], np.float32).ravel())
-        self._emitted = mi.Float(np.array([*emitted, [0.0] * len(responses)], np.float32).ravel())
+        self._rows = from_host(mi.Float, rows_of)
+        self._reflected = from_host(mi.Float, reflected or [[[0.0]]])
+        self._emitted = from_host(mi.Float, [*emitted, [0.0] * len(responses)])
         self._filters, self._colours = mi.UInt32(len(responses)), mi.UInt32(len(colours))
 
     def flux(

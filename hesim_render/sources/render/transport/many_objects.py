@@ -26,7 +26,7 @@ from hesim_render.core.device_types import (
     UInt32,
     Vector3,
 )
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
 from hesim_render.sources.render.transport.closed_form import SimpleForm
 from hesim_render.sources.render.transport.intersections import to_ball, to_face
@@ -67,9 +67,9 @@ class Fleet:
             for face, shape in form.faces:
                 codes = [3 * first + second for first, second, _ in face.order]
                 faces.append([*face.to_uvh.ravel(), _number(mi, shape), face.triangle, *codes])
-        self._heads = mi.UInt32(np.array(heads, np.uint32).ravel())
-        self._balls = table(mi.Float, np.array([*balls, [0.0] * _BALL], np.float32))
-        self._faces = table(mi.Float, np.array([*faces, [0.0] * _FACE], np.float32))
+        self._heads = from_host(mi.UInt32, heads)
+        self._balls = from_host(mi.Float, np.array([*balls, [0.0] * _BALL], np.float32))
+        self._faces = from_host(mi.Float, np.array([*faces, [0.0] * _FACE], np.float32))
         self._bunch, count = _BUNCH, len(forms)
         bunches = -(-count // self._bunch)
         self._first, self._end, self._bunches = (mi.UInt32(n) for n in (groups, groups + count, bunches))

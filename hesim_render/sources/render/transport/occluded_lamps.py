@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, LoopState, Mask, MitsubaObject, Ray, UInt32, Vector3
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.tracks import DevicePose
 from hesim_render.sources.render.transport.blockers import box_of, face_of
 from hesim_render.sources.render.transport.irradiance import RectangleLight
@@ -51,7 +51,7 @@ class LampShadows:
         rows = sorted(sorted(rows, key=lambda row: -_size(row))[:_MOST], key=lambda row: row[3])
         self.is_known = bool(rows)
         self._moves = any(row[3] > 0 for row in rows)
-        self._rows = table(mi.Float, np.array(rows or [[0.0] * _ROW], np.float32))
+        self._rows = from_host(mi.Float, np.array(rows or [[0.0] * _ROW], np.float32))
         self._count = dr.opaque(mi.UInt32, len(rows))
 
     def before(

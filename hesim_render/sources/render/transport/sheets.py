@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Bands, Float, Mask, MitsubaModule, MitsubaObject, Point2, Ray, UInt32
-from hesim_render.core.tables import table
+from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.mitsuba_version import mesh_faces, mesh_vertices
 from hesim_render.sources.render.transport.intersections import to_face
 
@@ -162,9 +162,9 @@ class DeviceSheet:
         rows[:-1, 9] = triangle.astype(np.uint32).view(np.float32)
         pointers: list[UInt32] = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)) for shape in shapes]
         numbers = [int(pointer[0]) for pointer in pointers]
-        self._cells, self._triangles = table(mi.UInt32, sheet.cell_rows), table(mi.Float, rows)
-        self._shape = table(mi.UInt32, np.array(numbers, np.uint32)[sheet.owner[:, 0]])
-        self._prim = table(mi.UInt32, sheet.owner[:, 1])
+        self._cells, self._triangles = from_host(mi.UInt32, sheet.cell_rows), from_host(mi.Float, rows)
+        self._shape = from_host(mi.UInt32, np.array(numbers, np.uint32)[sheet.owner[:, 0]])
+        self._prim = from_host(mi.UInt32, sheet.owner[:, 1])
         self._side, self._seam = mi.UInt32(2**sheet.halvings), mi.Float(sheet.seam_m)
         dr.make_opaque(self._rows, self._side, self._seam)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Ray, UInt32
+from hesim_render.core.host_arrays import from_host
 from hesim_render.core.method_cache import method_cache
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.camera import place_camera
@@ -192,9 +193,7 @@ class ChiefRays:
         offset = dr.opaque(types.Float, offset_px[0]), dr.opaque(types.Float, offset_px[1])
         for first in range(0, share.size, BLOCK_RAYS):
             part = slice(first, min(first + BLOCK_RAYS, share.size))
-            row, col, shares = (
-                types.Float(np.ascontiguousarray(values[part], np.float32)) for values in (at.row, at.col, share)
-            )
+            row, col, shares = (from_host(types.Float, values[part]) for values in (at.row, at.col, share))
             now = self._now(moments, shares)
             yield part, *self._seen(row, col, offset, now), now
 
@@ -279,14 +278,11 @@ class ChiefRays:
             start = origin[lanes]
             if self.view.near_m > 0:
                 start = start + direction[lanes] * self.view.near_m  # surfaces nearer than that are not seen
-            o, d = (
-                [types.Float(np.ascontiguousarray(v, np.float32)) for v in values.T]
-                for values in (start, direction[lanes])
-            )
+            o, d = ([from_host(types.Float, v) for v in values.T] for values in (start, direction[lanes]))
             ray = mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*d))
             reach = np.minimum((length[lanes] - self.view.near_m) * FREE_PART, 1e30)
-            ray.maxt = types.Float(reach.astype(np.float32))
-            now = self._now(moments, types.Float(share[first : first + BLOCK_RAYS]))
+            ray.maxt = from_host(types.Float, reach)
+            now = self._now(moments, from_host(types.Float, share[first : first + BLOCK_RAYS]))
             blocked, _ = self.parts.occluded(ray, now, mi.Bool(True))
             blocked = blocked | dr.zeros(mi.Bool, lanes.size)
             clear[lanes] = ~np.array(blocked)
