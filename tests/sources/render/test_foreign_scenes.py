@@ -184,6 +184,7 @@ def test_the_scenes_of_the_benchmark_take_the_default_mode_and_move(name):
     assert not source.is_static and source.settings["mode"] == "change-driven"
 
 
+@pytest.mark.slow
 def test_a_run_of_polished_copper_says_that_no_quality_would_do(monkeypatch):
     monkeypatch.setattr("hesim_render.sources.render.audit.audit._RAYS", 3_000_000)
     scene, sensor = hr.load_scene(BENCHMARK / "copper.yaml"), hr.load_sensor("davis346").crop(32, 24, 148, 106)

@@ -153,19 +153,19 @@ def test_in_a_furnace_all_light_is_there(scene_of):
 def test_shared_light_has_no_bias(scene_of, with_things):
     """Against the same number of paths that share nothing, while a box moves by two pixels within the window."""
     source = source_of(scene_of(WALLS + (THINGS if with_things else ""), motion=MOTION if with_things else ""))
-    shared, _ = both_of(source, 64, 40)
+    shared, _ = both_of(source, 64, 24)
     tracer, pixel, _ = parts_of(source)
     windows = Windows(np.array([31_000.0]), np.array([31_900.0]))
     given = pixel, np.zeros(pixel.size, np.int64), windows, np.full(pixel.size, 1024), np.zeros(pixel.size, np.bool_)
     alone = np.array([tracer.trace(*given, stream=Stream.AUDIT, repeat=k).mean for k in range(8)], np.float64)
     error = shared.mean(axis=0) - alone.mean(axis=0)
-    spread = np.sqrt(shared.var(axis=0, ddof=1) / 40 + alone.var(axis=0, ddof=1) / 8)
+    spread = np.sqrt(shared.var(axis=0, ddof=1) / 24 + alone.var(axis=0, ddof=1) / 8)
     z = error / spread
     # pixels of a tile are off together; a z of 8 degrees of freedom has more than one sixth above 1
     assert np.sqrt(np.mean(z**2)) < 1.5 and np.abs(z).max() < 6
     total = np.array([one.sum() for one in shared]), np.array([one.sum() for one in alone])
-    assert abs(total[0].mean() - total[1].mean()) < 4 * np.hypot(total[0].std() / 40**0.5, total[1].std() / 8**0.5)
-    assert total[0].std() / 40**0.5 < 2e-3 * total[0].mean()
+    assert abs(total[0].mean() - total[1].mean()) < 4 * np.hypot(total[0].std() / 24**0.5, total[1].std() / 8**0.5)
+    assert total[0].std() / 24**0.5 < 2e-3 * total[0].mean()
 
 
 @pytest.mark.parametrize(("turn_deg", "x", "lies"), [(-90, -0.05, False), (90, -0.5, False), (-90, -0.05, True)])
@@ -196,11 +196,11 @@ def test_no_light_is_shared_through_a_wall(scene_of, turn_deg, x, lies):
     things = sheet + upright(-0.6, 0.7, 0.9) + lamp
     floor = WALLS[: WALLS.index('<shape type="rectangle" id="back">')]
     source = source_of(scene_of(floor + things, camera=camera), crop=(13, 9, 164, 121))
-    shared, alone = (each.reshape(60, 9, 13) for each in both_of(source, 128, 60))
+    shared, alone = (each.reshape(40, 9, 13) for each in both_of(source, 128, 40))
     dark, light = ([each[:, :, part].mean(axis=(1, 2)) for each in (shared, alone)] for part in (np.s_[7:], np.s_[4:6]))
     assert lies or dark[1].mean() < 0.5 * light[1].mean()
     for one, other in (dark, light):
-        spread = np.hypot(one.std(ddof=1), other.std(ddof=1)) / 60**0.5
+        spread = np.hypot(one.std(ddof=1), other.std(ddof=1)) / 40**0.5
         assert abs(one.mean() - other.mean()) < 4 * spread and spread < 0.03 * other.mean()
 
 
@@ -582,11 +582,11 @@ def test_what_a_linked_pair_becomes():
 
 
 def test_linked_pairs_have_no_bias_and_the_noise_of_their_differences(scene_of):
-    """A whole run with few rays of pairs by themselves, for seven seeds, against paths that share nothing."""
+    """A whole run with few rays of pairs by themselves, for five seeds, against paths that share nothing."""
     few = replace(TUNING, most_rays=512, least_shared_rays=32, least_sharing_gain=0.1, difference_gain=1e9)
     scene = scene_of(WALLS + THINGS.split('<shape type="sphere" id="shiny">')[0], motion=MOTION)
     runs, linked = [], []
-    for seed in range(7):
+    for seed in range(5):
         source = source_of(scene, crop=(9, 7, 166, 121), seed=seed, tuning=few)
         given = Anchor.link
 
@@ -599,7 +599,7 @@ def test_linked_pairs_have_no_bias_and_the_noise_of_their_differences(scene_of):
             blocks = list(source.sample_blocks(1, 0, 5000))
             flux = source.flux_of_blocks(source.sensor.layout.evs_pixel.ravel(), blocks)
             runs.append([(np.array(one.half_a), np.array(one.half_b)) for one in flux])
-    assert sum(linked) > 7 * 20
+    assert sum(linked) > 5 * 20
     ends_us = np.concatenate([block.end_us[block.wanted] for block in blocks])
     halves = np.array(runs, np.float64)  # [seed, window, half, pixel]
     tracer, pixel, _ = parts_of(source)
@@ -609,6 +609,6 @@ def test_linked_pairs_have_no_bias_and_the_noise_of_their_differences(scene_of):
     truth = np.mean([tracer.trace(*given, stream=Stream.AUDIT, repeat=k).mean for k in range(2)], axis=0)
     values, truth = halves.mean(axis=2), truth.reshape(ends_us.size, -1)
     total = (values / truth).mean(axis=(1, 2)) - 1
-    assert abs(total.mean()) < 4 * total.std(ddof=1) / 7**0.5
+    assert abs(total.mean()) < 4 * total.std(ddof=1) / 5**0.5
     stated = 0.5 * (halves[:, :, 0] - halves[:, :, 1]) / truth
     assert np.sqrt(np.mean((values / truth - 1) ** 2)) == pytest.approx(np.sqrt(np.mean(stated**2)), rel=0.15)

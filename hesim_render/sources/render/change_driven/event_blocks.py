@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from hesim_render.mosaic.schedule import BLOCK_CELLS, CELL_US, Block
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us
-from hesim_render.sources.render.change_driven.estimates import Flux
+from hesim_render.sources.render.change_driven.estimates import Band, Flux
+from hesim_render.sources.render.change_driven.plan import Plan
 from hesim_render.sources.render.change_driven.windows import Windows
 
 #: Largest number of intervals of a block of an asynchronous sensor. The last window of each block is rendered at all
@@ -76,74 +77,78 @@ class Blocks:
 
     def take(self, block: Block) -> "BlockFlux":
         """Flux of the pixels that may change; with that of the others where few are constant."""
-        renderer, windows = self._renderer, Windows(block.begin_us, block.end_us)
+        windows = Windows(block.begin_us, block.end_us)
         # the block begins with the window that ended the one before, whose flux is known
         is_next = self._time == (block.begin_us[0], block.end_us[0])
-        parts: list[tuple[NDArray[np.int64], Knots]] = []
-        # interpolation runs between the middles of windows
-        centre = 0.5 * (block.begin_us + block.end_us)
-        # anchors of the first and of the last window, which is the first of the next block
-        span_us, end_us = (anchor_us(block.begin_us, block.end_us, renderer.has_ticks, k) for k in (0, -1))
-        last = windows.size - 1
-        for number, band in enumerate(self._bands):
-            # a new anchor every 64 ms; the old one is no longer compared with
-            if self._anchors[number].span_us != span_us:
-                self._anchors[number] = Anchor(renderer, band, span_us, near_us=windows.span_us)
-            anchor = ending = self._anchors[number]
-            first = self._last.at(band.place) if is_next else None
-            if first is not None and windows.size == 1:
-                parts.append((band.place, Knots.of(first, np.ones((1, band.place.size), np.bool_), centre)))
-                continue
-            numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.sites.size))
-            if end_us != span_us:
-                # what the next block will be compared with, which is no longer than this one or 32 ms
-                near_us = end_us[0], end_us[1] + max(float(np.ptp(block.end_us)), _LONGEST_US)
-                ending = self._anchors[number] = Anchor(renderer, band, end_us, near_us=near_us)
-            pilot, _ = renderer.pilot(
-                band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride, ending=ending.pilot
-            )
-            # what lies behind the last wanted window, at the end of a run, is not rendered
-            shares = None
-            if anchor.shares is not None and ending.shares is not None:
-                shares = anchor.shares, ending.shares
-            what = renderer.plan(pilot, band, is_knot=True, windows=windows, shares=shares).until(
-                int(np.flatnonzero(block.wanted)[-1])
-            )
-            numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.place.size))
-            if first is None and anchor.span_us == (block.begin_us[0], block.end_us[0]):
-                first = anchor.flux_of(np.arange(band.place.size))
-            if first is None:
-                # by itself, so that the other windows are traced by the calls of a run that comes from the block before
-                link = partial(anchor.link, windows, None)
-                first = renderer.render(band, windows, numbers[:1], what.first(), link=link)[0]
-                anchor.render(windows, what.first(), None, first)
-            # windows between two fits of one edge, and those that show what an earlier one does, drop out of the plan
-            what, fit, followed, held = renderer.follow(band, windows, numbers, what)
-            todo, known = what, what.rendered.copy()
-            if ending is not anchor and end_us == (block.begin_us[-1], block.end_us[-1]):
-                # the last window is the anchor of the next block
-                place = np.flatnonzero(what.rendered[last])
-                todo = what.without(np.full(place.size, last), place)
-            link = partial(ending.link, windows, first)
-            flux, _ = renderer.render(band, windows, numbers, todo, first=first, fit=fit, link=link)
-            # differences are put beside the pairs that were rendered by themselves
-            ending.render(windows, todo, first, flux)
-            if todo is not what:
-                for values, own in zip(flux.arrays, ending.flux_of(place).arrays, strict=True):
-                    values[last, place] = own[0]
-            # a fit of an edge may be held
-            held.fill(flux)
-            followed.fill(flux, centre)
-            # knots are windows that were rendered, those that an edge was followed through, and those that were held
-            known[followed.window, followed.pixel] = True
-            known[held.window, held.pixel] = True
-            parts.append((band.place, Knots.of(flux, known, centre)))
+        parts = [(band.place, self._knots(number, block, windows, is_next)) for number, band in enumerate(self._bands)]
         out = BlockFlux(self._last.half_a.shape[1], parts)
         # where a block goes on after the run, its last window may be unknown
         is_whole = bool(block.wanted[-1])
         self._time = (float(block.begin_us[-1]), float(block.end_us[-1])) if is_whole else None
         self._last = out.at(windows.size - 1)
         return out
+
+    def _knots(self, number: int, block: Block, windows: Windows, is_next: bool) -> "Knots":
+        """Knots of one band in a block; what else is known of it there, of which there is much, is let go."""
+        renderer, band, last = self._renderer, self._bands[number], windows.size - 1
+        # interpolation runs between the middles of windows
+        centre = 0.5 * (block.begin_us + block.end_us)
+        # anchors of the first and of the last window, which is the first of the next block
+        span_us, end_us = (anchor_us(block.begin_us, block.end_us, renderer.has_ticks, k) for k in (0, -1))
+        # a new anchor every 64 ms; the old one is no longer compared with
+        if self._anchors[number].span_us != span_us:
+            self._anchors[number] = Anchor(renderer, band, span_us, near_us=windows.span_us)
+        anchor = ending = self._anchors[number]
+        first = self._last.at(band.place) if is_next else None
+        if first is not None and windows.size == 1:
+            return Knots.of(first, np.ones((1, band.place.size), np.bool_), centre)
+        if end_us != span_us:
+            # what the next block will be compared with, which is no longer than this one or 32 ms
+            near_us = end_us[0], end_us[1] + max(float(np.ptp(block.end_us)), _LONGEST_US)
+            ending = self._anchors[number] = Anchor(renderer, band, end_us, near_us=near_us)
+        what = self._plan(band, block, windows, anchor, ending)
+        numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.place.size))
+        if first is None and anchor.span_us == (block.begin_us[0], block.end_us[0]):
+            first = anchor.flux_of(np.arange(band.place.size))
+        if first is None:
+            # by itself, so that the other windows are traced by the calls of a run that comes from the block before
+            link = partial(anchor.link, windows, None)
+            first = renderer.render(band, windows, numbers[:1], what.first(), link=link)[0]
+            anchor.render(windows, what.first(), None, first)
+        # windows between two fits of one edge, and those that show what an earlier one does, drop out of the plan
+        what, fit, followed, held = renderer.follow(band, windows, numbers, what)
+        todo, known = what, what.rendered.copy()
+        if ending is not anchor and end_us == (block.begin_us[-1], block.end_us[-1]):
+            # the last window is the anchor of the next block
+            place = np.flatnonzero(what.rendered[last])
+            todo = what.without(np.full(place.size, last), place)
+        link = partial(ending.link, windows, first)
+        flux, _ = renderer.render(band, windows, numbers, todo, first=first, fit=fit, link=link)
+        # differences are put beside the pairs that were rendered by themselves
+        ending.render(windows, todo, first, flux)
+        if todo is not what:
+            for values, own in zip(flux.arrays, ending.flux_of(place).arrays, strict=True):
+                values[last, place] = own[0]
+        # a fit of an edge may be held
+        held.fill(flux)
+        followed.fill(flux, centre)
+        # knots are windows that were rendered, those that an edge was followed through, and those that were held
+        known[followed.window, followed.pixel] = True
+        known[held.window, held.pixel] = True
+        return Knots.of(flux, known, centre)
+
+    def _plan(self, band: Band, block: Block, windows: Windows, anchor: Anchor, ending: Anchor) -> Plan:
+        """Plan of a band in a block; what lies behind the last wanted window, at the end of a run, is not rendered."""
+        renderer = self._renderer
+        numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.sites.size))
+        pilot, _ = renderer.pilot(
+            band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride, ending=ending.pilot
+        )
+        shares = None
+        if anchor.shares is not None and ending.shares is not None:
+            shares = anchor.shares, ending.shares
+        what = renderer.plan(pilot, band, is_knot=True, windows=windows, shares=shares)
+        return what.until(int(np.flatnonzero(block.wanted)[-1]))
 
 
 @dataclass(frozen=True)
