@@ -19,11 +19,12 @@ KINDS = ["Float", "Float64", "UInt32", "Int32", "UInt64", "Bool", "Int8", "UInt8
 # Memory that ends where a page begins that may not be read, and a kernel that reads a number in order. With "direct",
 # Dr.Jit gets the memory itself.
 GUARDED = """
-import ctypes, mmap, sys
+import ctypes, mmap, resource, sys
 import numpy as np
 from hesim_render.core import host_arrays
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
+resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 kind, count = getattr(jit(), sys.argv[2]), int(sys.argv[3])
 page, kept = mmap.PAGESIZE, []
 def guarded(size, dtype):
