@@ -43,10 +43,6 @@ def windows(sensor: Sensor, spec: SharpSpec, duration_us: int) -> Iterator[tuple
         yield middle, middle - spec.window_us / 2 + offset
 
 
-def _frame_pixels(sensor: Sensor) -> NDArray[np.uint32]:
-    return np.flatnonzero(sensor.layout.aps_mask).astype(np.uint32)
-
-
 def sharp_flux(
     source: FluxSource, sensor: Sensor, spec: SharpSpec, begin_us: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -57,7 +53,7 @@ def sharp_flux(
     source, sensor, spec : see `write_sharp`.
     begin_us : begin of each row's window, [row], from `windows`.
     """
-    pixel = _frame_pixels(sensor)
+    pixel = sensor.layout.aps_pixel
     first = begin_us[pixel // sensor.cols]
     half_a, half_b = source.mean_flux(pixel, first, first + spec.window_us)
     return np.array(half_a, dtype=np.float32), np.array(half_b, dtype=np.float32)
@@ -83,7 +79,7 @@ def write_sharp(
     types = jit()
     clean, _ = noise_models(sensor, clean=True)
     assert clean is not None
-    pixel = _frame_pixels(sensor)
+    pixel = sensor.layout.aps_pixel
     shape, exposure_s = (len(times), sensor.rows, sensor.cols), aps.exposure_us * S_PER_US
     with new_file(path) as file:
         file.attrs.update({

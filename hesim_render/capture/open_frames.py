@@ -63,7 +63,6 @@ class OpenFrames:
         self._sensor, self._aps, self._exposures = sensor, aps, exposures
         self._source, self._seed = source, seed
         self._pixel = frame_pixels(sensor, aps)
-        self._row = self._pixel // sensor.layout.cols
         #: Number of pieces that are exposed, and frames in exposure, by their index.
         self._exposed, self._open = 0, dict[int, OpenFrame]()
         self.errors = ErrorMeter()
@@ -113,10 +112,11 @@ class OpenFrames:
         starts = frame.exposure.row_begin_us(np.arange(self._sensor.rows))
         first = np.maximum(starts, begin_us)
         last = np.minimum(starts + frame.exposure.exposure_us, end_us)
-        where = np.flatnonzero((last > first)[self._row])
+        row = self._pixel // self._sensor.layout.cols
+        where = np.flatnonzero((last > first)[row])
         if where.size == 0:
             return
-        rows = self._row[where]
+        rows = row[where]
         half_a, half_b = self._source.mean_flux(self._pixel[where], first[rows], last[rows])
         types = jit()
         seconds = from_host(types.Float, (last - first)[rows] * S_PER_US)
@@ -162,4 +162,4 @@ class OpenFrames:
 
 def frame_pixels(sensor: Sensor, aps: ApsNoise | None) -> NDArray[np.uint32]:
     """Mosaic indices of the pixels that give frame values, [n]; none without a noise model."""
-    return np.flatnonzero(sensor.layout.aps_mask).astype(np.uint32) if aps is not None else np.empty(0, np.uint32)
+    return sensor.layout.aps_pixel if aps is not None else np.empty(0, np.uint32)

@@ -2,12 +2,12 @@
 
 import warnings
 from collections.abc import Callable
-from functools import cached_property
 
-from hesim_render.capture.error_meter import stated_verdict
+from hesim_render.capture.error_meter import ErrorMeter, stated_verdict
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.overheads import with_overheads
 from hesim_render.capture.run_settings import Noise, RunSettings
+from hesim_render.core.device import dr
 from hesim_render.core.errors import SpecError, TooLongError
 from hesim_render.core.progress import Progress
 from hesim_render.recording.truth_file import EVENTS
@@ -18,7 +18,7 @@ from hesim_render.sources.render.audit.units import NotedFlux
 from hesim_render.sources.render.change_driven.flux import QUALITY
 from hesim_render.sources.render.renderer import SceneRenderer
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
-from hesim_render.sources.renderer import Demand, Estimate
+from hesim_render.sources.renderer import Estimate
 from hesim_render.sources.scene import Scene
 
 
@@ -35,14 +35,10 @@ class SceneRun:
 
     def __init__(self, renderer: SceneRenderer, noise: Noise, settings: RunSettings, progress: Progress | None) -> None:
         self._renderer, self._noise, self._settings, self._progress = renderer, noise, settings, progress
-        # knows what the run asks for, and captures nothing
-        self._plain = Capture(renderer, renderer.sensor, *noise, settings.duration_us, settings.seed)
-        self._capture = self._plain
+        # a capture knows what the run asks for; this one takes nothing
+        self._demand = Capture(renderer, renderer.sensor, *noise, settings.duration_us, settings.seed).demand
+        self._errors: dict[str, ErrorMeter] = {}
         self._noted: NotedFlux | None = None
-
-    @cached_property
-    def _demand(self) -> Demand:
-        return self._plain.demand
 
     def expect(self, on_estimate: Callable[[Estimate], None] | None) -> Estimate | None:
         """Estimate the run, where anybody wants to know, and refuse one that is too long.
@@ -98,15 +94,16 @@ class SceneRun:
             frames = 1 if source.is_static else max(1, len(self._demand.exposures))
             windows = round(self._demand.blocks.windows)
             self._noted = NotedFlux(source, self._demand.event_pixel, windows, frames, *stretch, settings.seed)
-        self._capture = Capture(
+        capture = Capture(
             self._noted or source, source.sensor, *self._noise, settings.duration_us, settings.seed,
             labels=EVENTS in settings.kinds,
         )  # fmt: skip
-        self._capture.record(writer, self._progress)
+        capture.record(writer, self._progress)
+        self._errors = capture.errors
 
     def verdict(self) -> dict[str, object]:
         """The entry ``render`` of the manifest: errors, work, and whether the render is good enough."""
-        renderer, errors = self._renderer, self._capture.errors
+        renderer, errors = self._renderer, self._errors
         result: dict[str, object] = {
             "error_noise": {name: meter.as_dict(renderer.quality) for name, meter in errors.items()}
         }
@@ -116,6 +113,8 @@ class SceneRun:
         elif renderer.quality is not None and self._noted is not None and renderer.auditable is not None:
             if self._progress is not None:
                 self._progress(0, 1, "audit")
+            # what the run took on the device is let go
+            dr.flush_malloc_cache()
             evs = renderer.sensor.evs if renderer.sensor.spec.evs is not None else None
             pixels, seed = self._demand.event_pixel, self._settings.seed
             result["audit"] = Audit(self._noted, renderer.auditable, renderer.quality, evs, pixels, seed).run()

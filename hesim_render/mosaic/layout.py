@@ -118,6 +118,11 @@ class Layout(PlainState):
         return self.has_role("aps")
 
     @cached_property
+    def aps_pixel(self) -> NDArray[np.uint32]:
+        """Mosaic index (row · cols + col in this region) of each frame pixel, in order, [n]."""
+        return np.flatnonzero(self.aps_mask).astype(np.uint32)
+
+    @cached_property
     def full_index(self) -> NDArray[np.uint32]:
         """Index of each pixel on the full sensor, row-major, [row, col]; it is the key of random numbers."""
         cols = self.spec.geometry.cols

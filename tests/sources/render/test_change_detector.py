@@ -12,7 +12,7 @@ import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream
-from hesim_render.sources.render.change_driven import event_blocks
+from hesim_render.sources.render.change_driven import one_window
 from hesim_render.sources.render.change_driven import pilot as pilots
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.change_detector import windows_with_changes
@@ -464,7 +464,7 @@ def test_few_constant_pixels_go_on_with_the_pilot_of_all(monkeypatch):
     sensor = hr.load_sensor("reference-mono", {"evs.threshold_mismatch_rel": 0.02}).crop(40, 24)
     found = []
     for few in (1.0, 0.0):
-        monkeypatch.setattr(event_blocks, "FEW", few)
+        monkeypatch.setattr(one_window, "FEW", few)
         source = ChangeDrivenFlux(ball_before_a_wall(), sensor, seed=4)
         found.append((fluxes(source, 0, 6000), source.counts.pilot_rays))
         constant = source.still_pixels(source.sensor.layout.evs_pixel.ravel())

@@ -22,6 +22,7 @@ from hesim_render.mosaic.schedule import BLOCK_INTERVALS, CELL_US
 from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven.estimates import Flux
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.one_window import render_one_window
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer, Windows
 from hesim_render.sources.render.change_driven.sample_instants import STEP_PX, MotionClock
 from hesim_render.sources.render.change_driven.tuning import TUNING
@@ -166,7 +167,7 @@ def test_a_pixel_in_which_no_ray_saw_light_states_the_error_that_is_wanted():
     for least in (8, 64):
         source = ChangeDrivenFlux(mitsuba_scene(shapes), sensor, quality, 3, tuning=replace(TUNING, dark_rays=least))
         out = Flux.zeros(1, pixel.size)
-        source._renderer.alone(pixel, begin, begin + 1, "events", out)
+        render_one_window(source._renderer, pixel, begin, begin + 1, "events", out)
         rays.append(source.counts.rays)
     half, dark = 0.5 * np.abs(out.half_a - out.half_b)[0], (out.half_a + out.half_b)[0] == 0
     assert 120 < dark.sum() < 180

@@ -13,7 +13,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream
 from hesim_render.mosaic.schedule import Block
-from hesim_render.sources.render.change_driven import adaptive
+from hesim_render.sources.render.change_driven import adaptive, event_blocks
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.differences import Differences
 from hesim_render.sources.render.change_driven.edge_courses import Courses
@@ -483,15 +483,20 @@ def test_held_windows_are_knots_and_the_ends_of_courses():
 
 
 @pytest.mark.parametrize(("has_ticks", "end_us"), [(False, 192_000), (True, 128_000)])
-def test_a_run_begins_with_the_anchor_of_its_first_block(has_ticks, end_us):
+def test_a_run_begins_with_the_anchor_of_its_first_block(monkeypatch, has_ticks, end_us):
     """At a multiple of 64 ms, or of four blocks of 32 ms where these are of ticks."""
     times = 220_000 + np.linspace(0, 32_000, 5)
     seen = []
     renderer = SimpleNamespace(
         has_ticks=has_ticks, counts=SimpleNamespace(values=0),
-        alone=lambda pixel, begin, end, *_, keep: (seen.append((begin, end, keep)), [])[1],
         still=lambda role: SimpleNamespace(known=np.ones(9, np.bool_)),
     )  # fmt: skip
+
+    def render(renderer, pixel, begin, end, *_, keep):
+        seen.append((begin, end, keep))
+        return []
+
+    monkeypatch.setattr(event_blocks, "render_one_window", render)
     blocks = Blocks(renderer, np.array([2, 5], np.uint32), Block(times - 70, times, np.ones(5, np.bool_)))
     [(begin, end, keep)] = seen
     assert blocks.alive.size == 0 and keep == (219_930, 252_000)

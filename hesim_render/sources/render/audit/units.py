@@ -240,12 +240,14 @@ class NotedFlux:
         number = np.arange(len(one.halves)) + one.skipped
         core = (number >= self._before) & (number < self._before + self._core)
         if core.any():
-            begin, end = (np.repeat(t[:, None], one.place.size, axis=1) for t in np.array(one.windows).T)
+            # all pixels of a stretch have its windows, which are held once
+            shape = number.size, one.place.size
+            begin, end = (np.broadcast_to(time[:, None], shape) for time in np.array(one.windows).T)
             flux, difference = np.array(one.halves).swapaxes(0, 1)
             assert one.base is not None
             (base_begin, base_end), of_base = one.base
-            count = one.place.size
-            base = np.full((1, count), base_begin), np.full((1, count), base_end), of_base[:1], of_base[1:]
+            base_us = (np.broadcast_to(time, (1, one.place.size)) for time in (base_begin, base_end))
+            base = *base_us, of_base[:1], of_base[1:]
             given = pixel[one.place], begin, end, core, flux, difference, np.array(one.error)
             self.events.append(Units(*given, *base))
 

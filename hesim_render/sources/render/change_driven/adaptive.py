@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.distinct import distinct_columns
 from hesim_render.sources.render.change_driven.aim import PairAims
 from hesim_render.sources.render.change_driven.bends import straightened
 from hesim_render.sources.render.change_driven.deep_shadow import deep_shadow
@@ -16,7 +15,7 @@ from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Band, Counts, Flux, Still
 from hesim_render.sources.render.change_driven.held_pairs import HeldPairs, held_pairs
-from hesim_render.sources.render.change_driven.neighbours import REACH, Sites, of_own_row, turns
+from hesim_render.sources.render.change_driven.neighbours import Sites, squares
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux
 from hesim_render.sources.render.change_driven.pilot import Anchored, Pilot, take_pilot
 from hesim_render.sources.render.change_driven.plan import Plan, Shares, plan
@@ -26,14 +25,20 @@ from hesim_render.sources.render.change_driven.sharing import Sharing
 from hesim_render.sources.render.change_driven.small_objects import Zoom
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
+from hesim_render.sources.render.tracer import rays_at_once
 
-#: Pixels that are processed at a time, to bound memory.
-BAND_PIXELS = 1 << 17
 _ALWAYS_US = (-np.inf, np.inf)
 #: See `Anchor.link`.
 Link = Callable[[Plan, NDArray, NDArray, PairEdges | None, PairFlux], NDArray[np.float32]]
 #: Part of the wanted error below which a flux counts as no light at all.
 _NOTHING = np.float32(1e-3)
+
+
+def pixels_at_once() -> int:
+    """Number of pixels that are processed at a time, to bound memory; no value depends on it. The 32 pilot rays of each
+    are traced at once, in arrays of a power of two, as Dr.Jit's memory is.
+    """
+    return rays_at_once() // 32
 
 
 class AdaptiveRenderer:
@@ -90,16 +95,15 @@ class AdaptiveRenderer:
         return self._kept[role]
 
     def bands(self, pixel: NDArray[np.uint32], role: Role) -> Iterator[Band]:
-        """The listed pixels in bands of successive rows."""
+        """The listed pixels in bands, each of which is about square."""
         index, lattice = self.index[pixel], self.noise.lattice(role)
-        order, apart, tuning = np.argsort(index, kind="stable"), self.noise.is_apart(role), self.tuning
+        apart, tuning = self.noise.is_apart(role), self.tuning
         rays = tuning.lone_pilot_rays if apart else tuning.pilot_rays
         # where edges cross a pixel within a window, strata gain less; a pilot in a wide area sees more than its pixel
         quality, mild = self.quality, self.tracer.is_diffuse and (apart or not self.has_ticks)
         if role == "any":
             rays, quality, mild = tuning.frame_pilot_rays, quality / tuning.frame_margin, False
-        for first in range(0, order.size, BAND_PIXELS):
-            place = order[first : first + BAND_PIXELS]
+        for place in squares(*np.divmod(index, self._sensor.spec.geometry.cols), pixels_at_once()):
             # a single window is not followed through time, and needs no pixels beside those that lie apart
             if lattice is None or (apart and role == "any"):
                 sites = Sites.alone(index[place])
@@ -296,55 +300,3 @@ class AdaptiveRenderer:
         return about_edges(
             *(self.tracer, pairs, *given, self.gain, self.tuning), tried=tried, known=known, shadows=shadows
         )
-
-    def alone(
-        self,
-        pixel: NDArray[np.uint32],
-        begin: NDArray[np.float64],
-        end: NDArray[np.float64],
-        role: Role,
-        out: Flux,
-        keep: tuple[float, float] | None = None,
-    ) -> list[tuple[Band, Anchored]]:
-        """Put the flux of listed pixels, each in its own window, into `out` [1, n]. Constant pixels are rendered
-        once.
-
-        Parameters
-        ----------
-        keep : keep the pilot's rays, where all pixels have one window; with what comes near within an interval, µs.
-
-        Returns
-        -------
-        Bands with their pilots, where these are kept.
-        """
-        kept: list[tuple[Band, Anchored]] = []
-        self.counts.values += pixel.size
-        still = self.still(role)
-        known = still.known[pixel]
-        out.put(known, still.flux.at(pixel[known]))
-        waiting = np.flatnonzero(~known)
-        span, number = distinct_columns(np.stack([begin[waiting], end[waiting]]))
-        windows = Windows(span[0], span[1])
-        # neighbours use the window of their own row; a row with several windows is rendered once for each
-        turn = turns(pixel[waiting] // self._sensor.cols, number)
-        for k in range(int(turn.max(initial=-1)) + 1):
-            listed, window = waiting[turn == k], number[turn == k]
-            for band in self.bands(pixel[listed], role):
-                place, own = listed[band.place], window[band.place]
-                numbers = of_own_row(band.sites, own, self._sensor.spec.geometry.cols)[None]
-                own_pilot = None
-                if keep is not None:
-                    # the pilot of constant pixels looks at all times
-                    kept.append((band, self.pilot_rays(band, windows, still.span_us or keep)))
-                    own_pilot = kept[-1][1].flux
-                pilot, near = self.pilot(band, windows, numbers, still.span_us, known=own_pilot)
-                what = self.plan(pilot, band, is_knot=role == "events")
-                if role == "events":
-                    what = self.sharing.planned(what, band, self.counts)
-                flux, met = self.render(band, windows, own[None], what, still.span_us)
-                out.put(place, flux)
-                if still.span_us is not None:
-                    fixed = ~(band.sites.most(near, REACH) | met[0])
-                    still.known[pixel[place[fixed]]] = True
-                    still.flux.put(pixel[place[fixed]], flux.at(fixed))
-        return kept

@@ -39,7 +39,7 @@ def allocate(
         error, and number of rays that knowledge of an edge does not lower; see `Plan`.
     """
     low, high = (window, window + 1) if is_knot else (max(0, window - 1), window + 2)
-    flux, here = pilot.flux[window], sites.listed
+    flux, here = pilot.flux_in(window), sites.listed
     # noise unit and flux of the listed pixels, [n]; tables of the pilot have their neighbours as well, [site]
     own, value = units[window][here], flux[here]
     # variance of a single ray by either estimator, [n]: half from the pixel itself, half from those around it, as the
@@ -60,7 +60,7 @@ def allocate(
     controlled = (squares[0] <= squares[1]) & (2 * value >= open_flux[here])
     scatter = np.sqrt(np.where(controlled, *squares)) / _SMALLER
     # an edge in a neighbour may reach into this pixel between the pilot rays
-    around = pilot.flux[low:high]
+    around = pilot.flux_in(slice(low, high))
     highest, lowest = around.max(axis=0), around.min(axis=0)
     contrast = np.maximum(sites.most(highest, 1) - value, value + sites.most(-lowest, 1))
     unseen = np.float32(tuning.unseen_area**0.5) * contrast

@@ -12,10 +12,12 @@ from itertools import zip_longest
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device import dr
 from hesim_render.mosaic.schedule import BLOCK_CELLS, CELL_US, Block
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us
 from hesim_render.sources.render.change_driven.estimates import Band, Flux
+from hesim_render.sources.render.change_driven.one_window import render_one_window
 from hesim_render.sources.render.change_driven.plan import Plan
 from hesim_render.sources.render.change_driven.windows import Windows
 
@@ -24,8 +26,6 @@ from hesim_render.sources.render.change_driven.windows import Windows
 INTERVALS = 64
 #: Longest block of an asynchronous sensor, µs.
 _LONGEST_US = BLOCK_CELLS * CELL_US
-#: Part of the pixels that may be constant and yet be traced in each block, so that the first pilot of all goes on.
-FEW = 1 / 256
 
 
 class Blocks:
@@ -51,20 +51,20 @@ class Blocks:
         # the anchor of the first window at all pixels: constant pixels keep this flux for the whole run
         begin, end = (np.full(pixel.size, time) for time in span_us)
         near_us = Windows(first.begin_us, first.end_us).span_us
-        kept = renderer.alone(pixel, begin, end, "events", self.base, keep=near_us)
+        kept = render_one_window(renderer, pixel, begin, end, "events", self.base, keep=near_us)
         # values of the anchor are no samples of the sensor
         renderer.counts.values -= pixel.size
         self.alive = np.flatnonzero(~renderer.still("events").known[pixel])
         self.own, known = np.arange(self.alive.size), self.base.at(self.alive)
         kept_pixels = sum(band.place.size for band, _ in kept)
-        if kept_pixels == pixel.size and pixel.size - self.alive.size <= FEW * pixel.size:
+        if kept_pixels == pixel.size:
+            # few are constant
             self.own, known = self.alive, self.base
         # all pixels that may change, or nearly only these: their bands and pilots go on
         if known.error.shape[1] == kept_pixels:
             pilots = [pilot for _, pilot in kept]
             self._bands = [band for band, _ in kept]
         else:
-            # those of all pixels are let go before the others are traced: they hold half a gigabyte of a large sensor
             kept.clear()
             pilots, self._bands = [], list(renderer.bands(pixel[self.alive], "events"))
         self._anchors = [
@@ -80,7 +80,10 @@ class Blocks:
         windows = Windows(block.begin_us, block.end_us)
         # the block begins with the window that ended the one before, whose flux is known
         is_next = self._time == (block.begin_us[0], block.end_us[0])
+        # Dr.Jit keeps memory for arrays of sizes that it had; those of rays, of frames and of pixels are all others
+        dr.flush_malloc_cache()
         parts = [(band.place, self._knots(number, block, windows, is_next)) for number, band in enumerate(self._bands)]
+        dr.flush_malloc_cache()
         out = BlockFlux(self._last.half_a.shape[1], parts)
         # where a block goes on after the run, its last window may be unknown
         is_whole = bool(block.wanted[-1])

@@ -27,6 +27,7 @@ from hesim_render.sources.render.change_driven.estimates import Counts, Flux
 from hesim_render.sources.render.change_driven.event_blocks import INTERVALS, BlockFlux, Blocks
 from hesim_render.sources.render.change_driven.forecast import forecast
 from hesim_render.sources.render.change_driven.foresight import Foresight
+from hesim_render.sources.render.change_driven.one_window import render_one_window
 from hesim_render.sources.render.change_driven.references import References
 from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
 from hesim_render.sources.render.change_driven.sample_instants import MotionClock
@@ -174,7 +175,7 @@ class ChangeDrivenFlux:
             raise RangeError("end_us - begin_us", float(np.min(end - begin)), "0 or more")
         flux = Flux.zeros(1, pixels.size)
         if not self._is_dark and pixels.size:
-            self._renderer.alone(pixels, begin, end, "any", flux)
+            render_one_window(self._renderer, pixels, begin, end, "any", flux)
         half_a, half_b = from_host(types.Float, flux.half_a[0]), from_host(types.Float, flux.half_b[0])
         require_finite(half_a, half_b, self._scene, self.sensor.layout, pixels)
         return half_a, half_b

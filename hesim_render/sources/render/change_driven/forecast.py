@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.sources.render.change_driven.adaptive import BAND_PIXELS
+from hesim_render.sources.render.change_driven.adaptive import pixels_at_once
 from hesim_render.sources.render.change_driven.anchor import anchor_us, period_us
-from hesim_render.sources.render.change_driven.event_blocks import FEW
+from hesim_render.sources.render.change_driven.one_window import FEW
 from hesim_render.sources.renderer import Demand, Estimate
 
 if TYPE_CHECKING:
@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 _PATCHES, _SIDE, _BLOCKS = 192, 4, 3
 #: Number of pixels, where these have no neighbours of their kind.
 _SINGLE = 4096
-#: Memory of the program with its kernels, per event pixel and window of a block, and per event pixel and frame pixel
-#: of the stages, bytes.
-_BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 14, 110, 60
+#: Memory of the program with its kernels, per window of a block and pixel processed at a time, per event pixel (its
+#: pilot rays) and per frame pixel, bytes: within a fifth of the star on `davis346` and `eiger`, the sweep on `gen2`
+#: and `imx636`.
+_BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 75, 350, 50
 #: Time of plans, statistics and copies for each ray, beside that of tracing it, s: of event pixels (`rotating-star` on
 #: `davis346` and `eiger`, `camera-sweep` on `gen2`, 0.02 s each), and of frames (`camera-sweep` and `pendulum` on
 #: `reference-bayer`, 0.04 s each), on two threads of AVX-512 servers.
@@ -78,7 +79,7 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         rest = begin + each * demand.blocks.count + anchors * more_anchors + compared * (1 + more_anchors)
         picture += float(first.rays[0] + alive_part * rest) * event_pixel.size
         pilots += float(first.rays[3] + alive_part * (looks * demand.blocks.count - saved)) * event_pixel.size
-        bands = np.ceil(alive_part * event_pixel.size / BAND_PIXELS)
+        bands = np.ceil(alive_part * event_pixel.size / pixels_at_once())
         traces += float(bands * np.mean([block.traces for block in blocks]) * demand.blocks.count)
         beside_s = (picture + pilots) * _BESIDE_S
     # frames; of a static scene each pixel once, those of events included
@@ -90,13 +91,16 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         picture += float(frame.rays[:3].sum()) * pixel.size * times
         beside_s += float(frame.rays.sum()) * pixel.size * times * _FRAME_BESIDE_S
         pilots += float(frame.rays[3]) * pixel.size * times
-        traces += frame.traces * float(np.ceil(pixel.size / BAND_PIXELS)) * times
+        traces += frame.traces * float(np.ceil(pixel.size / pixels_at_once())) * times
     speed, rays = look.speed(), picture + pilots
     path_audit = _PATH_AUDIT_RAYS * min(1.0, demand.duration_us / _PATH_AUDIT_US)
-    held = _WINDOW_BYTES * windows * event_pixel.size
+    held = _EVENT_BYTES * event_pixel.size
     return Estimate(
         seconds=picture * speed.picture_ray_s + pilots * speed.pilot_ray_s + beside_s + traces * speed.start_s,
-        peak_bytes=_BASE_BYTES + held + _EVENT_BYTES * event_pixel.size + _FRAME_BYTES * demand.frame_pixel.size,
+        peak_bytes=_BASE_BYTES
+        + _WINDOW_BYTES * windows * min(event_pixel.size, pixels_at_once())
+        + held
+        + _FRAME_BYTES * demand.frame_pixel.size,
         rays=rays,
         held_bytes=held,
         audit_rays=path_audit if source.sees_paths and not source.has_ticks else float("inf"),

@@ -220,6 +220,30 @@ def _most_along(image: NDArray, length: int) -> NDArray:
     return image
 
 
+def squares(row: NDArray[np.integer], col: NDArray[np.integer], most: int) -> list[NDArray[np.int64]]:
+    """Parts of a list of pixels that are about square, so that few neighbours lie around them; places in the list.
+
+    Parameters
+    ----------
+    row, col : [n], rows and columns of the pixels.
+    most : largest number of pixels in a part.
+    """
+    if row.size <= most:
+        # by row, then by column
+        return [np.lexsort((col, row))] if row.size else []
+    height, width = int(np.ptp(row)) + 1, int(np.ptp(col)) + 1
+    # strips of columns, as wide as a square in which so many pixels lie
+    side = np.sqrt(most * height * width / row.size)
+    count = max(1, round(width / side))
+    strip = (col.astype(np.int64) - int(col.min())) * count // width
+    order = np.lexsort((col, row, strip))
+    parts = []
+    for own in np.split(order, np.flatnonzero(np.diff(strip[order])) + 1):
+        # parts of a strip are equal in number
+        parts += np.array_split(own, -(-own.size // most))
+    return parts
+
+
 def turns(row: NDArray[np.integer], window: NDArray[np.integer]) -> NDArray[np.int64]:
     """For each pair: the number of other windows of its row that come first, [n]."""
     # distinct pairs in order of row, then of window: the rank of each counts from the first of its row
@@ -231,10 +255,23 @@ def turns(row: NDArray[np.integer], window: NDArray[np.integer]) -> NDArray[np.i
     return rank[place]
 
 
-def of_own_row(sites: Sites, window: NDArray[np.integer], cols: int) -> NDArray[np.int64]:
-    """Window of each site: that of the listed pixels in its row, or in the nearest row that has any."""
-    row, listed = sites.index.astype(np.int64) // cols, sites.index[sites.listed].astype(np.int64) // cols
-    rows, first = np.unique(listed, return_index=True)
-    # the middle between two rows parts the sites of one from those of the other
-    nearest = np.searchsorted((rows[1:] + rows[:-1]) / 2, row)
-    return window[first[nearest]].astype(np.int64)
+class RowWindows:
+    """Windows of the rows of listed pixels, of which each row has one. They hold for the whole list, so that no value
+    depends on how the list is divided.
+
+    Parameters
+    ----------
+    row : [n], row on the full sensor of each listed pixel.
+    window : [n], window of each.
+    """
+
+    def __init__(self, row: NDArray[np.integer], window: NDArray[np.integer]) -> None:
+        self._rows = np.flatnonzero(np.bincount(row))
+        of_row = np.zeros(int(self._rows[-1]) + 1, np.int64)
+        of_row[row] = window
+        self._window = of_row[self._rows]
+
+    def at(self, row: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Window of pixels in some rows [m]: that of listed pixels in the row, or in the nearest row that has any."""
+        # the middle between two rows parts the pixels of one from those of the other
+        return self._window[np.searchsorted((self._rows[1:] + self._rows[:-1]) / 2, row)]

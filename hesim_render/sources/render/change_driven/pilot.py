@@ -122,10 +122,10 @@ class Pilot:
         """Number of windows."""
         return self.controlled.shape[0]
 
-    @cached_property
-    def flux(self) -> NDArray[np.float32]:
-        """Flux by the estimator with less scatter in each window, [window, site], e⁻/s."""
-        return np.where(self.controlled_scatter <= self.plain_scatter, self.controlled, self.plain)
+    def flux_in(self, window: int | slice) -> NDArray[np.float32]:
+        """Flux by the estimator with less scatter in each window, of one window or some, [(window,) site], e⁻/s."""
+        is_controlled = self.controlled_scatter[window] <= self.plain_scatter[window]
+        return np.where(is_controlled, self.controlled[window], self.plain[window])
 
     @cached_property
     def steady_flux(self) -> NDArray[np.float32]:

@@ -158,7 +158,7 @@ def plan(
     count, last = pilot.windows, pilot.windows - 1
     shape = count, sites.listed.size
     # noise units of all sites, [window, site]; the pilot has neighbours besides the listed pixels
-    units = np.stack([unit(flux) for flux in pilot.flux])
+    units = np.stack([unit(pilot.flux_in(window)) for window in range(count)])
     out = Plan(
         np.ones(shape, np.bool_),
         np.zeros(shape, np.int16),
@@ -166,7 +166,8 @@ def plan(
         np.zeros(shape, np.float32),
         np.float32(quality) * units[:, sites.listed],
         np.zeros(shape, np.int16),
-        Differences.none(*shape),
+        # those are chosen last, when all rays are known
+        Differences.none(0, 0),
         np.zeros(shape, np.bool_),
         np.zeros(shape, np.bool_),
         np.zeros(shape, np.bool_),
@@ -175,30 +176,7 @@ def plan(
         None if pilot.shadows is None else pilot.shadows[:, sites.listed],
     )
     if last > 1:
-        # what must change, at least, for a window to be rendered, [window, site]
-        flux, least = pilot.steady_flux, np.float32(tuning.change * tuning.tolerance * quality) * units
-        marked = changes(flux, least)
-        if pilot.deep is not None:
-            # many rays in a few windows say when deep shadow ends
-            marked[:, pilot.deep.place] |= changes(pilot.deep.flux, least[:, pilot.deep.place])
-        # a large change of a neighbour may reach a pixel, and an extreme one more pixels and windows away
-        large = changes(flux, np.float32(tuning.large_change) * least)
-        extreme = longer(changes(flux, np.float32(tuning.extreme_change) * least), tuning.extreme_windows)
-        # the first and the last window are rendered anyway, as the ends of all interpolation
-        for window in range(1, last):
-            near = sites.most(large[window], 1) | sites.most(extreme[window], 2)
-            own = marked[window][sites.listed]
-            out.rendered[window] = own | near
-            # from one tick to the next an edge goes too far for a pair to keep the flux of an earlier one
-            out.asked[window] = near & ~own & follows
-        if pilot.refined:
-            # an object that passes within a window or two does not change the flux linearly
-            looked_at = np.zeros(flux.shape, np.bool_)
-            for window, refined in enumerate(pilot.refined):
-                looked_at[window, refined.place] = True
-            out.barred[:] = longer(looked_at, 1)[:, sites.listed]
-            out.rendered[1:last] |= out.barred[1:last]
-            out.asked[:] &= ~out.barred
+        _choose_windows(out, pilot, sites, units, quality, tuning, follows)
     # rays, estimator and expected error of every pair; many windows are interpolated from the ends of a block
     for window, some in enumerate(map(np.flatnonzero, out.rendered)):
         at_end = is_knot and window in (0, last)
@@ -211,3 +189,47 @@ def plan(
         worth = out.rendered & (out.rays >= tuning.edge_least_rays) & (chosen.rays == 0) & ~out.barred
         out.fitted[:] = fitted_windows(worth)
     return replace(out, differences=chosen)
+
+
+def _choose_windows(
+    out: Plan,
+    pilot: Pilot,
+    sites: Sites,
+    units: NDArray[np.float32],
+    quality: float,
+    tuning: Tuning,
+    follows: bool,
+) -> None:
+    """Put into a plan which windows between the first and the last are rendered, for whom, and which are barred.
+
+    Parameters
+    ----------
+    out : the plan.
+    units : [window, site], noise units, e⁻/s.
+    pilot, sites, quality, tuning, follows : see `plan`.
+    """
+    last = pilot.windows - 1
+    # what must change, at least, for a window to be rendered, [window, site]
+    flux, least = pilot.steady_flux, np.float32(tuning.change * tuning.tolerance * quality) * units
+    marked = changes(flux, least)
+    if pilot.deep is not None:
+        # many rays in a few windows say when deep shadow ends
+        marked[:, pilot.deep.place] |= changes(pilot.deep.flux, least[:, pilot.deep.place])
+    # a large change of a neighbour may reach a pixel, and an extreme one more pixels and windows away
+    large = changes(flux, np.float32(tuning.large_change) * least)
+    extreme = longer(changes(flux, np.float32(tuning.extreme_change) * least), tuning.extreme_windows)
+    # the first and the last window are rendered anyway, as the ends of all interpolation
+    for window in range(1, last):
+        near = sites.most(large[window], 1) | sites.most(extreme[window], 2)
+        own = marked[window][sites.listed]
+        out.rendered[window] = own | near
+        # from one tick to the next an edge goes too far for a pair to keep the flux of an earlier one
+        out.asked[window] = near & ~own & follows
+    if pilot.refined:
+        # an object that passes within a window or two does not change the flux linearly
+        looked_at = np.zeros(flux.shape, np.bool_)
+        for window, refined in enumerate(pilot.refined):
+            looked_at[window, refined.place] = True
+        out.barred[:] = longer(looked_at, 1)[:, sites.listed]
+        out.rendered[1:last] |= out.barred[1:last]
+        out.asked[:] &= ~out.barred

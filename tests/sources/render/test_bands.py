@@ -1,0 +1,85 @@
+"""Pixels are rendered in bands to bound memory. No value depends on how a list of pixels is divided into them."""
+
+import numpy as np
+import pytest
+from test_change_driven import ball_before_a_wall, noisy
+
+import hesim_render as hr
+from hesim_render.sources.render.change_driven import adaptive
+from hesim_render.sources.render.change_driven.estimates import Flux
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.neighbours import Lattice, RowWindows, Sites, squares
+from hesim_render.sources.render.change_driven.one_window import render_one_window
+
+
+def test_parts_are_about_square_and_hold_each_pixel_once():
+    rng = np.random.default_rng(4)
+    # a region of 61 × 337 pixels away from the corner, of which a few are missing, in any order
+    row, col = (values.ravel()[: 61 * 337 - 400] for values in np.mgrid[13:74, 29:366])
+    order = rng.permutation(row.size)
+    row, col, most = row[order], col[order], 700
+    parts = squares(row, col, most)
+    np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(row.size))
+    assert max(part.size for part in parts) <= most and len(parts) <= 1.5 * row.size / most
+    lattice = Lattice.whole(80, 400)
+    around = [Sites.around(lattice.index(row[part], col[part]), lattice).size for part in parts]
+    # three pixels around squares of 26 × 26 are half as many as those in them, around two rows of 337 thrice as many
+    assert sum(around) < 1.65 * row.size
+    # each part by row, then by column
+    for part in [*parts, *squares(row, col, row.size)]:
+        assert np.all(np.diff(row[part] * 400 + col[part]) > 0)
+    assert len(squares(row, col, row.size)) == 1 and squares(row[:0], col[:0], most) == []
+
+
+def test_rows_without_listed_pixels_have_the_window_of_the_nearest_one():
+    of_rows = RowWindows(np.array([12, 5, 12, 6]), np.array([3, 9, 3, 7]))
+    assert of_rows.at(np.array([0, 5, 6, 8, 10, 12, 40])).tolist() == [9, 9, 7, 7, 3, 3, 3]
+
+
+@pytest.fixture
+def small_bands(monkeypatch):
+    """Bands of so many pixels."""
+    return lambda most: monkeypatch.setattr(adaptive, "pixels_at_once", lambda: most)
+
+
+def test_events_are_the_same_in_small_bands(small_bands):
+    sensor = hr.load_sensor("davis346", {"evs.threshold_mismatch_rel": 0.02}).crop(46, 30, 151, 113)
+
+    def flux():
+        source = ChangeDrivenFlux(hr.load_scene("rotating-star"), sensor, seed=6)
+        pixel, blocks = source.sensor.layout.evs_pixel.ravel(), source.sample_blocks(1, 0, 2500)
+        return np.array([np.array(one.half_a) for one in source.flux_of_blocks(pixel, blocks)])
+
+    whole = flux()
+    small_bands(300)
+    np.testing.assert_array_equal(flux(), whole)
+    assert np.any(np.ptp(whole, axis=0) > 0)
+
+
+def test_frames_of_a_rolling_shutter_are_the_same_in_small_bands(small_bands):
+    """Neighbours beyond a band have the exposure of their own row, in which the picture may be another one."""
+    sensor = hr.load_sensor("eiger", {"aps.shutter": "rolling"}).crop(44, 40, 1608, 1204)
+    scene = hr.load_scene("rotating-star")
+
+    def flux():
+        source = ChangeDrivenFlux(scene, sensor, seed=6)
+        pixel = np.arange(44 * 40, dtype=np.uint32)
+        begin_us = 3000.0 * (pixel // 44)
+        return np.array(source.mean_flux(pixel, begin_us, begin_us + 700))
+
+    whole = flux()
+    small_bands(200)
+    np.testing.assert_array_equal(flux(), whole)
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_the_rays_of_all_pixels_are_kept_only_where_nearly_all_may_change(small_bands, moves):
+    small_bands(500)
+    sensor = noisy(64, 48)
+    source = ChangeDrivenFlux(hr.load_scene("camera-sweep") if moves else ball_before_a_wall(), sensor, seed=2)
+    pixel = source.sensor.layout.evs_pixel.ravel()
+    begin = np.zeros(pixel.size)
+    kept = render_one_window(
+        source._renderer, pixel, begin, begin + 900, "events", Flux.zeros(1, pixel.size), keep=(0.0, 2000.0)
+    )
+    assert sum(band.place.size for band, _ in kept) == (pixel.size if moves else 0)
