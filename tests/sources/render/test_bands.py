@@ -1,5 +1,7 @@
 """Pixels are rendered in bands to bound memory. No value depends on how a list of pixels is divided into them."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from test_change_driven import ball_before_a_wall, noisy
@@ -54,6 +56,22 @@ def test_events_are_the_same_in_small_bands(small_bands):
     small_bands(300)
     np.testing.assert_array_equal(flux(), whole)
     assert np.any(np.ptp(whole, axis=0) > 0)
+
+
+def test_memory_of_a_block_is_that_of_a_band(small_bands):
+    """Tables of 65 windows of 64 × 48 pixels take 0.8 MB each, of which a block without bands holds two dozen."""
+    sensor, peaks = hr.load_sensor("davis346", {"evs.threshold_mismatch_rel": 0.02}).crop(64, 48, 141, 107), []
+    for most in (64 * 48, 400):
+        small_bands(most)
+        source = ChangeDrivenFlux(hr.load_scene("rotating-star"), sensor, seed=6)
+        pixel, blocks = source.sensor.layout.evs_pixel.ravel(), source.sample_blocks(1, 0, 1000)
+        tracemalloc.start()
+        for _ in source.flux_of_blocks(pixel, blocks):
+            pass
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    whole, in_bands = peaks
+    assert whole > 12e6 and in_bands < 0.4 * whole
 
 
 def test_frames_of_a_rolling_shutter_are_the_same_in_small_bands(small_bands):

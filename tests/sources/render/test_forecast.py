@@ -1,5 +1,7 @@
-"""Forecasts of the rays of a run from a sample of its pixels."""
+"""Forecasts of the rays of a run from a sample of its pixels, and of its memory."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -165,3 +167,23 @@ def test_rays_of_frames_have_less_beside_them():
     assert with_frames.rays - alone.rays == pytest.approx(300 * 2 * 125)
     seconds = 300 * 2 * (95 * 3e-6 + 30 * 2e-6 + 125 * 15e-9) + 2 * 7 * 0.04
     assert with_frames.seconds - alone.seconds == pytest.approx(seconds)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "sensor", "duration_s"), [("fan", "dvxplorer", 0.001), ("camera-sweep", "gen2", 0.005)]
+)
+def test_the_memory_of_a_run_is_the_estimated_one(scene, sensor, duration_s):
+    code = f"""
+import resource
+
+import hesim_render as hr
+
+told = []
+hr.simulate({scene!r}, {sensor!r}, duration_s={duration_s}, on_estimate=told.append)
+unit = 1 if __import__("sys").platform == "darwin" else 1024
+print(told[0].peak_bytes, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit)
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    estimate, peak = map(float, done.stdout.split()[-2:])
+    assert 0.7 < estimate / peak < 1.4

@@ -20,9 +20,9 @@ _PATCHES, _SIDE, _BLOCKS = 192, 4, 3
 #: Number of pixels, where these have no neighbours of their kind.
 _SINGLE = 4096
 #: Memory of the program with its kernels, per window of a block and pixel processed at a time, per event pixel (its
-#: pilot rays) and per frame pixel, bytes: within a fifth of the star on `davis346` and `eiger`, the sweep on `gen2`
-#: and `imx636`.
-_BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 75, 350, 50
+#: pilot rays) and per frame pixel, where there are frames, bytes: fitted to the star on `davis346` and `eiger`, the
+#: sweep on `gen2` and `imx636`; judged on `fan` on `dvxplorer`.
+_BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 75, 500, 60
 #: Time of plans, statistics and copies for each ray, beside that of tracing it, s: of event pixels (`rotating-star` on
 #: `davis346` and `eiger`, `camera-sweep` on `gen2`, 0.02 s each), and of frames (`camera-sweep` and `pendulum` on
 #: `reference-bayer`, 0.04 s each), on two threads of AVX-512 servers.
@@ -100,7 +100,7 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         peak_bytes=_BASE_BYTES
         + _WINDOW_BYTES * windows * min(event_pixel.size, pixels_at_once())
         + held
-        + _FRAME_BYTES * demand.frame_pixel.size,
+        + (_FRAME_BYTES * demand.frame_pixel.size if exposures else 0),
         rays=rays,
         held_bytes=held,
         audit_rays=path_audit if source.sees_paths and not source.has_ticks else float("inf"),
