@@ -176,12 +176,13 @@ def test_rays_of_frames_have_less_beside_them():
 def test_the_memory_of_a_run_is_the_estimated_one(scene, sensor, duration_s):
     code = f"""
 import resource
+import sys
 
 import hesim_render as hr
 
 told = []
 hr.simulate({scene!r}, {sensor!r}, duration_s={duration_s}, on_estimate=told.append)
-unit = 1 if __import__("sys").platform == "darwin" else 1024
+unit = 1 if sys.platform == "darwin" else 1024
 print(told[0].peak_bytes, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit)
 """
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
