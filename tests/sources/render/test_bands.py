@@ -8,7 +8,7 @@ from test_change_driven import ball_before_a_wall, noisy
 
 import hesim_render as hr
 from hesim_render.sources.render.change_driven import adaptive
-from hesim_render.sources.render.change_driven.estimates import Flux
+from hesim_render.sources.render.change_driven.estimates import Flux, Still
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.neighbours import Lattice, RowWindows, Sites, squares
 from hesim_render.sources.render.change_driven.one_window import render_one_window
@@ -36,6 +36,26 @@ def test_parts_are_about_square_and_hold_each_pixel_once():
 def test_rows_without_listed_pixels_have_the_window_of_the_nearest_one():
     of_rows = RowWindows(np.array([12, 5, 12, 6]), np.array([3, 9, 3, 7]))
     assert of_rows.at(np.array([0, 5, 6, 8, 10, 12, 40])).tolist() == [9, 9, 7, 7, 3, 3, 3]
+
+
+def test_constant_pixels_have_the_flux_that_they_were_noted_with_and_take_no_memory_beside_it():
+    rng, count = np.random.default_rng(8), 3_000_000
+    pixel = rng.permutation(count)[:70_000].astype(np.uint32)
+    flux = Flux(*(rng.uniform(1, 9, (1, pixel.size)).astype(np.float32) for _ in range(3)))
+    tracemalloc.start()
+    still, begin = Still((-5.0, 70.0), count), 0
+    for end in (20_000, 23_000, 70_000):
+        still.put(pixel[begin:end], flux.at(slice(begin, end)))
+        # of those that are known by now, in any order
+        asked = rng.permutation(end)[: end // 2]
+        for values, given in zip(still.at(pixel[asked]).arrays, flux.at(asked).arrays, strict=True):
+            np.testing.assert_array_equal(values, given)
+        np.testing.assert_array_equal(np.flatnonzero(still.known), np.sort(pixel[:end]))
+        begin = end
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # a byte of every pixel, and four numbers of those that are known
+    assert held < 1.3 * (count + 16 * pixel.size)
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,9 @@ _OF_BASE = ("base_begin_us", "base_end_us", "base_flux", "base_difference")
 class Units:
     """Stretches of successive windows of some pixels, arrays [window, unit].
 
+    Fluxes and errors are float32 while a run notes them, as the source gives them; those that are judged (`at`) are
+    float64.
+
     Parameters
     ----------
     pixel : [unit], mosaic indices.
@@ -41,21 +44,21 @@ class Units:
     begin_us: NDArray[np.float64]
     end_us: NDArray[np.float64]
     core: NDArray[np.bool_]
-    flux: NDArray[np.float64]
-    difference: NDArray[np.float64]
-    error: NDArray[np.float64]
+    flux: NDArray[Any]
+    difference: NDArray[Any]
+    error: NDArray[Any]
     base_begin_us: NDArray[np.float64]
     base_end_us: NDArray[np.float64]
-    base_flux: NDArray[np.float64]
-    base_difference: NDArray[np.float64]
+    base_flux: NDArray[Any]
+    base_difference: NDArray[Any]
 
     def at(self, place: NDArray) -> "Units":
         """Some of the units."""
-        values = {name: getattr(self, name)[:, place] for name in _OF_UNITS + _OF_BASE}
+        values = {name: getattr(self, name)[:, place].astype(np.float64, copy=False) for name in _OF_UNITS + _OF_BASE}
         return Units(pixel=self.pixel[place], core=self.core, **values)
 
     @property
-    def noisy(self) -> NDArray[np.float64]:
+    def noisy(self) -> NDArray[Any]:
         """Flux with an error as large as its own, [window, unit], e⁻/s."""
         return self.flux + self.difference
 
@@ -119,10 +122,10 @@ class _Open:
 
     place: NDArray[np.int64]
     skipped: int
-    base: "tuple[tuple[float, float], NDArray[np.float64]] | None" = None
+    base: "tuple[tuple[float, float], NDArray[np.float32]] | None" = None
     windows: list[tuple[float, float]] = field(default_factory=list)
-    halves: list[NDArray[np.float64]] = field(default_factory=list)
-    error: list[NDArray[np.float64]] = field(default_factory=list)
+    halves: list[NDArray[np.float32]] = field(default_factory=list)
+    error: list[NDArray[np.float32]] = field(default_factory=list)
 
 
 class NotedFlux:
@@ -223,8 +226,8 @@ class NotedFlux:
                     one.base = base[0], _mean_and_difference(base[1], one.place)
                 one.windows.append(window)
                 one.halves.append(_mean_and_difference(halves, one.place))
-                nothing = np.zeros(one.place.size)
-                one.error.append(nothing if sample.error is None else sample.error[one.place].astype(np.float64))
+                nothing = np.zeros(one.place.size, np.float32)
+                one.error.append(nothing if sample.error is None else sample.error[one.place].astype(np.float32))
             while units and len(units[0].halves) + units[0].skipped == self._before + self._core + self._after:
                 self._close(pixel, units.popleft())
             last = window, halves
@@ -252,9 +255,9 @@ class NotedFlux:
             self.events.append(Units(*given, *base))
 
 
-def _mean_and_difference(halves: Halves, place: NDArray[np.int64]) -> NDArray[np.float64]:
+def _mean_and_difference(halves: Halves, place: NDArray[np.int64]) -> NDArray[np.float32]:
     """Mean and half the difference of both halves at some places, [2, k]."""
     types = jit()
     index = from_host(types.UInt32, place)
     one, other = (np.array(dr.gather(types.Float, half, index), np.float64) for half in halves)
-    return np.stack([one + other, one - other]) / 2
+    return (np.stack([one + other, one - other]) / 2).astype(np.float32)

@@ -86,12 +86,7 @@ class AdaptiveRenderer:
         """The pixels of a role that are known to be constant, and their flux."""
         if role not in self._kept:
             may_rest = bool(self.tracer.parts.groups) and self.tracer.camera is None and not self.tracer.rays.spreads
-            count = self.index.size
-            self._kept[role] = Still(
-                _ALWAYS_US if may_rest else None,
-                np.zeros(count, np.bool_),
-                Flux.zeros(1, count if may_rest else 0),
-            )
+            self._kept[role] = Still(_ALWAYS_US if may_rest else None, self.index.size)
         return self._kept[role]
 
     def bands(self, pixel: NDArray[np.uint32], role: Role) -> Iterator[Band]:

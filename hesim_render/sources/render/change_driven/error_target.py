@@ -36,7 +36,7 @@ class Noise:
             for place in spec.positions("aps"):
                 self._is_frame[place] = True
         #: Number of the event position at each place of the tile; 0, the first one, at other places.
-        self._position = np.zeros((rows, cols), np.int64)
+        self._position = np.zeros((rows, cols), np.uint16)
         #: Places of both roles, if the quieter one of them decides.
         self._is_both = np.zeros((rows, cols), np.bool_)
         if spec.evs is not None:
@@ -87,7 +87,7 @@ class Noise:
         seconds = np.float32(exposure_us * S_PER_US) * power
         return lambda flux: (noise.noise_equivalent_e(flux * seconds, exposure_us) / seconds).astype(np.float32)
 
-    def _event_unit(self, position: NDArray[np.int64]) -> NoiseUnit:
+    def _event_unit(self, position: NDArray[np.uint16]) -> NoiseUnit:
         noise = self._sensor.evs
         seconds = np.float32(noise.spec.window_us * S_PER_US) * np.float32(self._power)
         return lambda flux: (noise.noise_equivalent_e(flux * seconds, position) / seconds).astype(np.float32)

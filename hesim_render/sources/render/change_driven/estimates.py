@@ -42,21 +42,45 @@ class Flux:
             values[:, place] = new
 
 
-@dataclass
 class Still:
     """Pixels of a region whose flux is known to be the same at all times.
+
+    Only their flux is held: on a sensor whose event pixels lie apart, these are a small part of all pixels.
 
     Parameters
     ----------
     span_us : interval in which moving objects are tested for coming near, µs; None where all pixels may change, or
         nothing moves.
+    count : number of pixels of the region.
+
+    Attributes
+    ----------
+    span_us : as given.
     known : [pixel], True where the flux is known to be constant.
-    flux : [1, pixel], flux of these pixels.
     """
 
-    span_us: tuple[float, float] | None
-    known: NDArray[np.bool_]
-    flux: Flux
+    def __init__(self, span_us: tuple[float, float] | None, count: int) -> None:
+        self.span_us, self.known = span_us, np.zeros(count, np.bool_)
+        #: Known pixels in increasing order, and their flux; then those that came later, in any order.
+        self._pixel, self._flux = np.empty(0, np.uint32), Flux.zeros(1, 0)
+        self._later: list[tuple[NDArray[np.uint32], Flux]] = []
+
+    def put(self, pixel: NDArray[np.uint32], flux: Flux) -> None:
+        """Note some pixels [n] as constant, with their flux [1, n]."""
+        self.known[pixel] = True
+        self._later.append((pixel, flux))
+
+    def at(self, pixel: NDArray[np.uint32]) -> Flux:
+        """Flux of some known pixels, [1, n]."""
+        if self._later:
+            # in order once for all that came since, which takes less than to keep a place for each pixel of the region
+            pixels, fluxes = zip((self._pixel, self._flux), *self._later, strict=True)
+            every = np.concatenate(pixels)
+            order = np.argsort(every, kind="stable")
+            parts = zip(*(flux.arrays for flux in fluxes), strict=True)
+            self._pixel, self._flux = every[order], Flux(*(np.concatenate(part, axis=1)[:, order] for part in parts))
+            self._later.clear()
+        return self._flux.at(np.searchsorted(self._pixel, pixel))
 
 
 @dataclass(frozen=True)

@@ -257,3 +257,5 @@ class ChangeDrivenFlux:
                 half_a, half_b = from_host(types.Float, values[0]), from_host(types.Float, values[1])
                 require_finite(half_a, half_b, self._scene, self.sensor.layout, pixels)
                 yield Sample(half_a, half_b, values[2])
+            # the next block is rendered without this one's knots in memory
+            flux = BlockFlux(0, [])

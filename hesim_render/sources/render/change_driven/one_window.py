@@ -45,7 +45,8 @@ def render_one_window(
     renderer.counts.values += pixel.size
     still = renderer.still(role)
     known = still.known[pixel]
-    out.put(known, still.flux.at(pixel[known]))
+    if known.any():
+        out.put(known, still.at(pixel[known]))
     waiting = np.flatnonzero(~known)
     span, number = distinct_columns(np.stack([begin[waiting], end[waiting]]))
     windows = Windows(span[0], span[1])
@@ -71,8 +72,7 @@ def render_one_window(
             out.put(place, flux)
             if still.span_us is not None:
                 fixed = ~(band.sites.most(near, REACH) | met[0])
-                still.known[pixel[place[fixed]]] = True
-                still.flux.put(pixel[place[fixed]], flux.at(fixed))
+                still.put(pixel[place[fixed]], flux.at(fixed))
                 at_rest += int(np.count_nonzero(fixed))
                 if at_rest > FEW * pixel.size:
                     # the rays of all pixels hold half a gigabyte of a large sensor
