@@ -61,7 +61,7 @@ def test_constant_pixels_have_the_flux_that_they_were_noted_with_and_take_no_mem
 @pytest.fixture
 def small_bands(monkeypatch):
     """Bands of so many pixels."""
-    return lambda most: monkeypatch.setattr(adaptive, "pixels_at_once", lambda: most)
+    return lambda most: monkeypatch.setattr(adaptive, "pixels_at_once", lambda *_: most)
 
 
 def test_events_are_the_same_in_small_bands(small_bands):

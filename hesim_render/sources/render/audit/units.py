@@ -87,23 +87,19 @@ def in_random_order(noted: Sequence[Units], rng: np.random.Generator, least: int
     A batch is made when it is asked for, because an audit stops long before the last one.
     """
     size_of = np.array([units.pixel.size for units in noted])
-    which = np.repeat(np.arange(len(noted)), size_of)
+    which, begins = np.repeat(np.arange(len(noted)), size_of), np.cumsum(size_of) - size_of
     order, first, size = rng.permutation(which.size), 0, least
-    # units of one shape stand in one place: number of the shape of each list, and where its first unit stands
-    shapes: dict[bytes, list[int]] = {}
-    for number, units in enumerate(noted):
-        shapes.setdefault(units.core.tobytes(), []).append(number)
-    shape, begin = np.zeros(len(noted), np.intp), np.zeros(len(noted), np.intp)
-    for number, members in enumerate(shapes.values()):
-        shape[members], begin[members] = number, np.cumsum(size_of[members]) - size_of[members]
-    joined = [Units.joined([noted[member] for member in members]) for members in shapes.values()]
-    stands = np.arange(which.size) - np.repeat(np.cumsum(size_of) - size_of - begin, size_of)
     while first < order.size:
         chosen = order[first : first + size]
         here = np.argsort(which[chosen], kind="stable")  # list by list
-        kinds = shape[which[chosen[here]]]
-        parts = {number: here[kinds == number] for number in dict.fromkeys(kinds.tolist())}
-        yield [(first + place, joined[number].at(stands[chosen[place]])) for number, place in parts.items()]
+        # units of one shape are put together
+        shapes: dict[bytes, list[tuple[NDArray[np.int64], Units]]] = {}
+        for place in np.split(here, np.flatnonzero(np.diff(which[chosen[here]])) + 1):
+            number = which[chosen[place[0]]]
+            units = noted[number].at(chosen[place] - begins[number])
+            shapes.setdefault(units.core.tobytes(), []).append((first + place, units))
+        parts = (zip(*members, strict=True) for members in shapes.values())
+        yield [(np.concatenate(places), Units.joined(units)) for places, units in parts]
         first, size = first + chosen.size, min(2 * size, most)
 
 

@@ -34,11 +34,12 @@ Link = Callable[[Plan, NDArray, NDArray, PairEdges | None, PairFlux], NDArray[np
 _NOTHING = np.float32(1e-3)
 
 
-def pixels_at_once() -> int:
-    """Number of pixels that are processed at a time, to bound memory; no value depends on it. The 32 pilot rays of each
-    are traced at once, in arrays of a power of two, as Dr.Jit's memory is.
+def pixels_at_once(role: Role, has_ticks: bool) -> int:
+    """Number of pixels that are processed at a time, to bound memory; no value depends on it. It is a power of two, as
+    Dr.Jit's memory is. The 32 pilot rays of each are traced at once. A block of ticks has a quarter of the windows of
+    another one, so that the plan of four times as many pixels fits into the same memory.
     """
-    return rays_at_once() // 32
+    return rays_at_once() // (8 if has_ticks and role == "events" else 32)
 
 
 class AdaptiveRenderer:
@@ -98,7 +99,7 @@ class AdaptiveRenderer:
         quality, mild = self.quality, self.tracer.is_diffuse and (apart or not self.has_ticks)
         if role == "any":
             rays, quality, mild = tuning.frame_pilot_rays, quality / tuning.frame_margin, False
-        for place in squares(*np.divmod(index, self._sensor.spec.geometry.cols), pixels_at_once()):
+        for place in squares(*np.divmod(index, self._sensor.spec.geometry.cols), pixels_at_once(role, self.has_ticks)):
             # a single window is not followed through time, and needs no pixels beside those that lie apart
             if lattice is None or (apart and role == "any"):
                 sites = Sites.alone(index[place])
