@@ -37,9 +37,9 @@ _NOTHING = np.float32(1e-3)
 def pixels_at_once(role: Role, has_ticks: bool) -> int:
     """Number of pixels that are processed at a time, to bound memory; no value depends on it. It is a power of two, as
     Dr.Jit's memory is. The 32 pilot rays of each are traced at once. A block of ticks has a quarter of the windows of
-    another one, so that the plan of four times as many pixels fits into the same memory.
+    another one, so that twice as many pixels are processed at a time.
     """
-    return rays_at_once() // (8 if has_ticks and role == "events" else 32)
+    return rays_at_once() // (16 if has_ticks and role == "events" else 32)
 
 
 class AdaptiveRenderer:
