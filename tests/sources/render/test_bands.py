@@ -121,3 +121,14 @@ def test_the_rays_of_all_pixels_are_kept_only_where_nearly_all_may_change(small_
         source._renderer, pixel, begin, begin + 900, "events", Flux.zeros(1, pixel.size), keep=(0.0, 2000.0)
     )
     assert sum(band.place.size for band, _ in kept) == (pixel.size if moves else 0)
+
+
+def test_every_ray_of_a_run_is_counted():
+    """0.07 s of an asynchronous sensor: a block begins with a new anchor, which is one of its own windows."""
+    sensor = hr.load_sensor("davis346").crop(12, 10, 174, 130)
+    source = ChangeDrivenFlux(hr.load_scene("rotating-star"), sensor, seed=6)
+    pixel, blocks = source.sensor.layout.evs_pixel.ravel(), list(source.sample_blocks(1, 0, 70_000))
+    assert len(blocks) > 1
+    for _ in source.flux_of_blocks(pixel, blocks):
+        pass
+    assert source.counts.rays + source.counts.pilot_rays == source.rays_traced > 0

@@ -83,6 +83,13 @@ class AdaptiveRenderer:
         self.sharing = Sharing(tracer, noise, quality, self.gain, tuning)
         self._kept: dict[Role, Still] = {}
 
+    @property
+    def uncounted(self) -> int:
+        """Number of rays that were traced and are not counted yet. What is counted in between drops out of the
+        difference of two such numbers.
+        """
+        return self.tracer.rays_done - self.counts.rays - self.counts.pilot_rays
+
     def still(self, role: Role) -> Still:
         """The pixels of a role that are known to be constant, and their flux."""
         if role not in self._kept:
@@ -248,7 +255,7 @@ class AdaptiveRenderer:
         todo = what.rendered & (what.differences.rays == 0)
         if first is not None:
             todo[0] = False
-        before = self.tracer.rays_done
+        before = self.uncounted
         window, place = np.nonzero(todo)
         aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
         pairs = band.index[place], numbers[todo], windows
@@ -257,7 +264,7 @@ class AdaptiveRenderer:
         shadows = None if what.shadows is None else what.shadows[todo]
         got = self.sharing.trace((*pairs, rays, what.controlled[todo]), shared, span_us, aims, edges, shadows)
         error = what.error[todo] if link is None else link(what, todo, rays, edges, got)
-        self.counts.rays += self.tracer.rays_done - before
+        self.counts.rays += self.uncounted - before
         self.counts.pairs += place.size
         if not self.tracer.is_diffuse:
             # rays that saw nothing do not show that there is nothing: halves of 0 would state an error of 0

@@ -91,7 +91,7 @@ class Anchor:
         todo = what.rendered & (chosen.rays > 0)
         if first is not None:
             todo[0] = False
-        before = renderer.tracer.rays_done
+        before = renderer.uncounted
         window, place = np.nonzero(todo)
         if place.size == 0:
             return
@@ -103,7 +103,7 @@ class Anchor:
             got.half_b,
             np.hypot(error, chosen.error[todo]),
         )
-        renderer.counts.rays += renderer.tracer.rays_done - before
+        renderer.counts.rays += renderer.uncounted - before
         renderer.counts.pairs += place.size
 
     def link(
@@ -222,10 +222,7 @@ class Anchor:
         if new.any():
             renderer, band = self._renderer, self._band
             what = replace(self._own_plan(), rendered=new[None])
-            before = renderer.tracer.rays_done
             flux, _ = renderer.render(band, self._windows, np.zeros((1, new.size), np.int64), what)
-            # they are counted with the differences
-            renderer.counts.rays -= renderer.tracer.rays_done - before
             self._flux.put(new, flux.at(new))
             self._is_known |= new
         return self._flux.at(place)
