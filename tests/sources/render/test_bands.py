@@ -1,6 +1,7 @@
 """Pixels are rendered in bands to bound memory. No value depends on how a list of pixels is divided into them."""
 
 import tracemalloc
+import weakref
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from test_change_driven import ball_before_a_wall, noisy
 import hesim_render as hr
 from hesim_render.sources.render.change_driven import adaptive
 from hesim_render.sources.render.change_driven.estimates import Flux, Still
+from hesim_render.sources.render.change_driven.event_blocks import Blocks
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.neighbours import Lattice, RowWindows, Sites, squares
 from hesim_render.sources.render.change_driven.one_window import render_one_window
@@ -121,6 +123,24 @@ def test_the_rays_of_all_pixels_are_kept_only_where_nearly_all_may_change(small_
         source._renderer, pixel, begin, begin + 900, "events", Flux.zeros(1, pixel.size), keep=(0.0, 2000.0)
     )
     assert sum(band.place.size for band, _ in kept) == (pixel.size if moves else 0)
+
+
+def test_a_block_is_rendered_when_the_one_before_is_no_longer_held(monkeypatch):
+    """The knots of a block of a large sensor take tens of megabytes."""
+    sensor = hr.load_sensor("davis346").crop(12, 10, 174, 130)
+    source = ChangeDrivenFlux(hr.load_scene("rotating-star"), sensor, seed=6)
+    take, taken = Blocks.take, []
+
+    def watched(self, block):
+        assert all(one() is None for one in taken)
+        flux = take(self, block)
+        taken.append(weakref.ref(flux))
+        return flux
+
+    monkeypatch.setattr(Blocks, "take", watched)
+    for _ in source.flux_of_blocks(sensor.layout.evs_pixel.ravel(), source.sample_blocks(1, 0, 40_000)):
+        pass
+    assert len(taken) > 1
 
 
 def test_every_ray_of_a_run_is_counted():

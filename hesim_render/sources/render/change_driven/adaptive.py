@@ -34,12 +34,12 @@ Link = Callable[[Plan, NDArray, NDArray, PairEdges | None, PairFlux], NDArray[np
 _NOTHING = np.float32(1e-3)
 
 
-def pixels_at_once(role: Role, has_ticks: bool) -> int:
-    """Number of pixels that are processed at a time, to bound memory; no value depends on it. It is a power of two, as
-    Dr.Jit's memory is. The 32 pilot rays of each are traced at once. A block of ticks has a quarter of the windows of
-    another one, so that twice as many pixels are processed at a time.
+def pixels_at_once(role: Role, has_ticks: bool, apart: bool) -> int:
+    """Number of pixels that are processed at a time, to bound memory; no value depends on it. The 32 pilot rays of each
+    are traced at once, in arrays of a power of two, as Dr.Jit's memory is. A block of ticks has fewer windows, so that
+    twice as many pixels that have neighbours take less memory; beside those that lie apart, others are looked at too.
     """
-    return rays_at_once() // (16 if has_ticks and role == "events" else 32)
+    return rays_at_once() // (16 if has_ticks and role == "events" and not apart else 32)
 
 
 class AdaptiveRenderer:
@@ -106,7 +106,8 @@ class AdaptiveRenderer:
         quality, mild = self.quality, self.tracer.is_diffuse and (apart or not self.has_ticks)
         if role == "any":
             rays, quality, mild = tuning.frame_pilot_rays, quality / tuning.frame_margin, False
-        for place in squares(*np.divmod(index, self._sensor.spec.geometry.cols), pixels_at_once(role, self.has_ticks)):
+        at_once = pixels_at_once(role, self.has_ticks, apart)
+        for place in squares(*np.divmod(index, self._sensor.spec.geometry.cols), at_once):
             # a single window is not followed through time, and needs no pixels beside those that lie apart
             if lattice is None or (apart and role == "any"):
                 sites = Sites.alone(index[place])

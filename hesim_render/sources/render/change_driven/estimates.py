@@ -73,7 +73,7 @@ class Still:
     def at(self, pixel: NDArray[np.uint32]) -> Flux:
         """Flux of some known pixels, [1, n]."""
         if self._later:
-            # in order once for all that came since, which takes less than to keep a place for each pixel of the region
+            # sorted once for all that came since; a table of all pixels of the region would take more memory
             pixels, fluxes = zip((self._pixel, self._flux), *self._later, strict=True)
             every = np.concatenate(pixels)
             order = np.argsort(every, kind="stable")

@@ -258,4 +258,4 @@ class ChangeDrivenFlux:
                 require_finite(half_a, half_b, self._scene, self.sensor.layout, pixels)
                 yield Sample(half_a, half_b, values[2])
             # the next block is rendered without this one's knots in memory
-            flux = BlockFlux(0, [])
+            del flux

@@ -46,6 +46,7 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
     """
     is_static, event_pixel, exposures = source.is_static, demand.event_pixel, demand.exposures
     rng, look = np.random.default_rng(source.seed), source.foresight
+    event_band = pixels_at_once("events", source.has_ticks, source.is_apart("events"))
     # rays of the picture and of pilots, and traces
     picture, pilots, traces, windows, beside_s = 0.0, 0.0, 0.0, 0, 0.0
     if event_pixel.size and demand.blocks.blocks:
@@ -79,7 +80,7 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         rest = begin + each * demand.blocks.count + anchors * more_anchors + compared * (1 + more_anchors)
         picture += float(first.rays[0] + alive_part * rest) * event_pixel.size
         pilots += float(first.rays[3] + alive_part * (looks * demand.blocks.count - saved)) * event_pixel.size
-        bands = np.ceil(alive_part * event_pixel.size / pixels_at_once("events", source.has_ticks))
+        bands = np.ceil(alive_part * event_pixel.size / event_band)
         traces += float(bands * np.mean([block.traces for block in blocks]) * demand.blocks.count)
         beside_s = (picture + pilots) * _BESIDE_S
     # frames; of a static scene each pixel once, those of events included
@@ -91,14 +92,14 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         picture += float(frame.rays[:3].sum()) * pixel.size * times
         beside_s += float(frame.rays.sum()) * pixel.size * times * _FRAME_BESIDE_S
         pilots += float(frame.rays[3]) * pixel.size * times
-        traces += frame.traces * float(np.ceil(pixel.size / pixels_at_once("any", source.has_ticks))) * times
+        traces += frame.traces * float(np.ceil(pixel.size / pixels_at_once("any", source.has_ticks, False))) * times
     speed, rays = look.speed(), picture + pilots
     path_audit = _PATH_AUDIT_RAYS * min(1.0, demand.duration_us / _PATH_AUDIT_US)
     held = _EVENT_BYTES * event_pixel.size
     return Estimate(
         seconds=picture * speed.picture_ray_s + pilots * speed.pilot_ray_s + beside_s + traces * speed.start_s,
         peak_bytes=_BASE_BYTES
-        + _WINDOW_BYTES * windows * min(event_pixel.size, pixels_at_once("events", source.has_ticks))
+        + _WINDOW_BYTES * windows * min(event_pixel.size, event_band)
         + held
         + (_FRAME_BYTES * demand.frame_pixel.size if exposures else 0),
         rays=rays,
