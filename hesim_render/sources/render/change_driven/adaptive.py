@@ -149,12 +149,16 @@ class AdaptiveRenderer:
         self.counts.pilot_rays += self.tracer.rays_done - before
         return pilot, near
 
-    def pilot_rays(self, band: Band, windows: Windows, near_us: tuple[float, float] | None) -> Anchored:
-        """Pilot of a band in the only window, with its rays, which say what comes near in an interval, µs."""
+    def pilot_rays(
+        self, band: Band, windows: Windows, near_us: tuple[float, float] | None, is_long: bool = False
+    ) -> Anchored:
+        """Pilot of a band in the only window, with its rays, which say what comes near in an interval, µs; see
+        `Anchored`.
+        """
         before, sites = self.tracer.rays_done, band.sites
         first = np.zeros(sites.size, np.int64)
         given = sites.index, first, windows, band.pilot_rays, self._footprint_px(band), near_us
-        anchored = Anchored(*self.tracer.pilot_rays(*given, mild=band.mild), windows.span_us, near_us)
+        anchored = Anchored(*self.tracer.pilot_rays(*given, mild=band.mild), windows.span_us, near_us, is_long)
         self.counts.pilot_rays += self.tracer.rays_done - before
         return anchored
 

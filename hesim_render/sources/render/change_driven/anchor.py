@@ -18,6 +18,9 @@ from hesim_render.sources.render.change_driven.windows import Windows
 
 #: Time from one anchor to the next, µs; for ticks, at least so many blocks.
 _PERIOD_US, _BLOCKS = 64_000, 4
+#: Blocks of one anchor from which on its pilot tells what comes near in any of them: each asks again, but for fewer
+#: sites. Chosen on `traffic-light`, so that blocks of the star stay as they are.
+_MANY_BLOCKS = 16
 
 
 def period_us(end_us: NDArray[np.float64], has_ticks: bool) -> float:
@@ -41,6 +44,12 @@ def anchor_us(
     return last - (end - float(begin_us[window])), last
 
 
+def is_short(renderer: AdaptiveRenderer, block_us: float) -> bool:
+    """True if many blocks of this length, µs, have the same anchor, whose pilot tells what rests in all of them."""
+    # where outlines before a sky move, the same rays, which meet nothing that moves, bring another flux
+    return not (renderer.has_ticks or renderer.tracer.moves_outlines) and _MANY_BLOCKS * block_us <= _PERIOD_US
+
+
 class Anchor:
     """The pixels of a band in one anchor. They are rendered when they are first needed.
 
@@ -48,8 +57,9 @@ class Anchor:
     ----------
     renderer, band : renders these pixels.
     span_us : begin and end of the anchor, µs.
+    block_us : interval of a block that begins with the anchor, in which the pilot tells what comes near, µs; None: it
+        tells nothing. Where blocks are so short that many have one anchor, it tells what comes near in any of them.
     flux : [1, n], flux of the pixels there, where it is known already.
-    near_us : interval in which the pilot tells what comes near, µs; that of a block which begins with the anchor.
     pilot : the pilot, where it is known.
 
     Attributes
@@ -63,13 +73,20 @@ class Anchor:
         renderer: AdaptiveRenderer,
         band: Band,
         span_us: tuple[float, float],
+        block_us: tuple[float, float] | None = None,
         flux: Flux | None = None,
-        near_us: tuple[float, float] | None = None,
         pilot: Anchored | None = None,
     ) -> None:
         self.span_us, self._renderer, self._band = span_us, renderer, band
         self._windows = Windows(*(np.array([time]) for time in span_us))
-        self.pilot = renderer.pilot_rays(band, self._windows, near_us) if pilot is None else pilot
+        near_us, is_long = None, False
+        if block_us is not None:
+            # what is met within an interval is known of windows within it, such as the anchor
+            near_us, length_us = (min(span_us[0], block_us[0]), max(span_us[1], block_us[1])), block_us[1] - block_us[0]
+            if is_short(renderer, length_us):
+                # the last block may go on behind the next anchor
+                near_us, is_long = (span_us[0], max(near_us[1], span_us[1] + _PERIOD_US + length_us)), True
+        self.pilot = pilot or renderer.pilot_rays(band, self._windows, near_us, is_long)
         count = band.place.size
         self._flux, self._is_known = Flux.zeros(1, count) if flux is None else flux, np.full(count, flux is not None)
         self._plan: Plan | None = None

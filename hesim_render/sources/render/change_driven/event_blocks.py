@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hesim_render.core.device import dr
 from hesim_render.mosaic.schedule import BLOCK_CELLS, CELL_US, Block
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
-from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us
+from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us, is_short
 from hesim_render.sources.render.change_driven.estimates import Band, Flux
 from hesim_render.sources.render.change_driven.one_window import render_one_window
 from hesim_render.sources.render.change_driven.plan import Plan
@@ -50,8 +50,8 @@ class Blocks:
         span_us = anchor_us(first.begin_us, first.end_us, renderer.has_ticks)
         # the anchor of the first window at all pixels: constant pixels keep this flux for the whole run
         begin, end = (np.full(pixel.size, time) for time in span_us)
-        near_us = Windows(first.begin_us, first.end_us).span_us
-        kept = render_one_window(renderer, pixel, begin, end, "events", self.base, keep=near_us)
+        block_us = Windows(first.begin_us, first.end_us).span_us
+        kept = render_one_window(renderer, pixel, begin, end, "events", self.base, keep=block_us)
         # values of the anchor are no samples of the sensor
         renderer.counts.values -= pixel.size
         self.alive = np.flatnonzero(~renderer.still("events").known[pixel])
@@ -68,7 +68,7 @@ class Blocks:
             kept.clear()
             pilots, self._bands = [], list(renderer.bands(pixel[self.alive], "events"))
         self._anchors = [
-            Anchor(renderer, band, span_us, known.at(band.place), near_us, pilot)
+            Anchor(renderer, band, span_us, block_us, known.at(band.place), pilot)
             for band, pilot in zip_longest(self._bands, pilots)
         ]
         #: Window whose flux is `_last`.
@@ -100,15 +100,17 @@ class Blocks:
         span_us, end_us = (anchor_us(block.begin_us, block.end_us, renderer.has_ticks, k) for k in (0, -1))
         # a new anchor every 64 ms; the old one is no longer compared with
         if self._anchors[number].span_us != span_us:
-            self._anchors[number] = Anchor(renderer, band, span_us, near_us=windows.span_us)
+            self._anchors[number] = Anchor(renderer, band, span_us, windows.span_us)
         anchor = ending = self._anchors[number]
         first = self._last.at(band.place) if is_next else None
         if first is not None and windows.size == 1:
             return Knots.of(first, np.ones((1, band.place.size), np.bool_), centre)
         if end_us != span_us:
             # what the next block will be compared with, which is no longer than this one or 32 ms
-            near_us = end_us[0], end_us[1] + max(float(np.ptp(block.end_us)), _LONGEST_US)
-            ending = self._anchors[number] = Anchor(renderer, band, end_us, near_us=near_us)
+            length_us = float(np.ptp(block.end_us))
+            if not is_short(renderer, length_us):
+                length_us = max(length_us, _LONGEST_US)
+            ending = self._anchors[number] = Anchor(renderer, band, end_us, (end_us[0], end_us[1] + length_us))
         what = self._plan(band, block, windows, anchor, ending)
         numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.place.size))
         if first is None and anchor.span_us == (block.begin_us[0], block.end_us[0]):

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
-from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us
+from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us, is_short
 from hesim_render.sources.render.change_driven.error_target import Role
 from hesim_render.sources.render.change_driven.neighbours import REACH
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -93,7 +93,10 @@ class Foresight:
             # of the sites, some are neighbours beyond the patch
             share, before = band.place.size / band.sites.size, renderer.counts.pilot_rays
             is_compared = role == "events" and not is_anchor
-            anchor = Anchor(renderer, band, anchor_us(begin_us, end_us, renderer.has_ticks)) if is_compared else None
+            anchor = None
+            if is_compared:
+                block_us = windows.span_us if is_short(renderer, float(np.ptp(end_us))) else None
+                anchor = Anchor(renderer, band, anchor_us(begin_us, end_us, renderer.has_ticks), block_us)
             rays[1] += share * (renderer.counts.pilot_rays - before)
             before, started = renderer.counts.pilot_rays, self._tracer.traces
             against = () if anchor is None else (anchor.pilot, renderer.look_stride)

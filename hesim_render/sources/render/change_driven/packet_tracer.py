@@ -146,6 +146,11 @@ class PacketTracer(Tracer):
         """True if all visible light is direct light on diffuse surfaces."""
         return isinstance(self._integrator, DiffuseIntegrator)
 
+    @property
+    def moves_outlines(self) -> bool:
+        """True if the same rays, which meet nothing that moves, may bring another flux at another time."""
+        return isinstance(self._integrator, DiffuseIntegrator) and self._integrator.moves_outlines
+
     def moves_within(self, windows: Windows) -> bool:
         """True if edges may move by more than a small part of a pixel within a window."""
         something = bool(self.parts.groups) or self.camera is not None

@@ -121,6 +121,14 @@ class PilotFlux:
             values[place] = getattr(others, name)[chosen]
         return replace(self, **tables)
 
+    def with_pairs(self, place: NDArray[np.int64], others: "PilotFlux") -> "PilotFlux":
+        """The same, but for some pairs, which show what others do; of the rest, nothing has been met."""
+        tables = {each.name: getattr(self, each.name).copy() for each in fields(self)}
+        tables["met"][:] = False
+        for name, values in tables.items():
+            values[place] = getattr(others, name)
+        return PilotFlux(**tables)
+
     def put(
         self,
         part: slice | NDArray[np.int64],

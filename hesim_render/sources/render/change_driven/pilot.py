@@ -56,12 +56,14 @@ class Anchored:
     rays : its rays.
     window_us : begin and end of the anchor, µs.
     near_us : interval for which `flux.met` holds, or a longer one, µs; None: that of the anchor.
+    is_long : True if this interval holds many blocks, so that each has to ask what comes near within its own.
     """
 
     flux: PilotFlux
     rays: PilotRays
     window_us: tuple[float, float]
     near_us: tuple[float, float] | None = None
+    is_long: bool = False
 
     def tells(self, span_us: tuple[float, float] | None) -> bool:
         """True if `flux.met` is True wherever a ray came near a moving object within an interval, µs."""
@@ -179,30 +181,39 @@ def take_pilot(
     """
     count, every, given = numbers.shape[0], np.arange(sites.size), (windows, rays, width_px)
     ending = anchored if ending is None else ending
+    # what no ray sees come near in the whole span is at rest; with a moving camera, or a lens that spreads light, rays
+    # cannot tell
+    knows = tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
+    # rays of the first window that others are compared with, and where those of each site stand among them
     own_rays: PilotRays | None = None
+    own_place, own_count = every, sites.size
     if known is not None:
         first = known
     elif anchored is None:
         first = tracer.pilot(sites.index, numbers[0], *given, span_us=span_us, mild=mild)
-    elif anchored.tells(span_us) and _is_window(anchored.window_us, windows, numbers[0]):
+    elif anchored.tells(span_us) and not anchored.is_long and _is_window(anchored.window_us, windows, numbers[0]):
         # the first window is the anchor itself, whose rays are known
         first, own_rays = anchored.flux, anchored.rays
     else:
-        before = anchored.rays, every
-        first, own_rays = tracer.pilot_rays(sites.index, numbers[0], *given, span_us=span_us, before=before, mild=mild)
+        some, first = every, anchored.flux
+        if anchored.is_long and anchored.tells(span_us) and knows:
+            # what nothing comes near for much longer shows here what it does in the anchor
+            some = np.flatnonzero(first.met) if first.met.any() else every[:1]
+        own_place, own_count = np.zeros(sites.size, np.int64), some.size
+        own_place[some] = np.arange(some.size)
+        listed, against = sites.index[some], (anchored.rays, some)
+        seen, own_rays = tracer.pilot_rays(listed, numbers[0, some], *given, span_us, before=against, mild=mild)
+        first = first.with_pairs(some, seen)
     # known shadows [window, site]: shapes that hide light in the first window do so in those that follow
     shadows, given_shadows = np.zeros((count, sites.size), np.uint32), (rays, width_px, wanted, mild)
     first, shadows[:] = with_known_shadows(tracer, (sites.index, numbers[0], windows), first, *given_shadows)
-    # what no ray sees come near in the whole span is at rest; with a moving camera, or a lens that spreads light, rays
-    # cannot tell
-    knows = tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
     near = first.met if knows else np.ones(sites.size, np.bool_)
 
     def look(window: NDArray[np.int64], place: NDArray[np.int64]) -> PilotFlux:
         """Trace sites in windows other than the first."""
         compared = None
         if ending is not None and own_rays is not None:
-            compared = joined(own_rays, ending.rays), place + np.where(window == count - 1, sites.size, 0)
+            compared = joined(own_rays, ending.rays), np.where(window == count - 1, own_count + place, own_place[place])
         return tracer.pilot(
             sites.index[place],
             numbers[window, place],

@@ -223,6 +223,11 @@ class DiffuseIntegrator:
         return controlled, plain if shadows is None else controlled, unshadowed, met
 
     @property
+    def moves_outlines(self) -> bool:
+        """True if outlines before the sky move: the known share of the sky changes where no ray meets anything too."""
+        return self._outlines is not None and bool(self._outlines.groups)
+
+    @property
     def knows_shadows(self) -> bool:
         """True if there are shapes whose shadows have a closed form."""
         return self._shadows is not None and self._shadows.is_known
