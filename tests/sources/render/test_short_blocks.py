@@ -6,6 +6,7 @@ import rendering
 
 import hesim_render as hr
 from hesim_render.sources.render.change_driven import anchor
+from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
 SUN = {"type": "directional", "direction": [0.2, 0.1, -1], "illuminance_lux": 1000}
@@ -64,3 +65,26 @@ def test_values_are_the_same_and_pilots_take_fewer_rays(monkeypatch, light, thin
     before, _, rays_before = run(scene, 60_100, 66_500)
     np.testing.assert_array_equal(before, values)
     assert rays_now[0] == rays_before[0] and rays_now[1] <= part * rays_before[1]
+
+
+def test_pilots_are_compared_with_the_same_rays_of_the_first_window(monkeypatch):
+    """Where only some sites are traced in the first window, others keep what the anchor shows."""
+    scene, pilot, seen = scene_of(SUN, {}), AdaptiveRenderer.pilot, []
+
+    def watched(*given, **named):
+        result = pilot(*given, **named)
+        seen.append(result[0])
+        return result
+
+    monkeypatch.setattr(AdaptiveRenderer, "pilot", watched)
+    for many in (anchor._MANY_BLOCKS, np.inf):
+        monkeypatch.setattr(anchor, "_MANY_BLOCKS", many)
+        run(scene, 60_100, 66_500)
+    half = len(seen) // 2
+    changes = [[one.change for one in part if one.change is not None] for part in (seen[:half], seen[half:])]
+    assert len(changes[0]) >= 4
+    for one, other in zip(*changes, strict=True):
+        # from the first window to those between
+        assert one.controlled.shape[0] < 3 or np.any(one.controlled_scatter[1:-1] > 0)
+        for name in ("controlled", "plain", "controlled_scatter", "plain_scatter"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))

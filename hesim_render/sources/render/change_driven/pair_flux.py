@@ -122,9 +122,8 @@ class PilotFlux:
         return replace(self, **tables)
 
     def with_pairs(self, place: NDArray[np.int64], others: "PilotFlux") -> "PilotFlux":
-        """The same, but for some pairs, which show what others do; of the rest, nothing has been met."""
+        """The same, but for some pairs, which show what others do."""
         tables = {each.name: getattr(self, each.name).copy() for each in fields(self)}
-        tables["met"][:] = False
         for name, values in tables.items():
             values[place] = getattr(others, name)
         return PilotFlux(**tables)
