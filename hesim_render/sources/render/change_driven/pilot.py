@@ -202,7 +202,8 @@ def take_pilot(
         own_place, own_count = np.zeros(sites.size, np.int64), some.size
         own_place[some] = np.arange(some.size)
         listed, against = sites.index[some], (anchored.rays, some)
-        seen, own_rays = tracer.pilot_rays(listed, numbers[0, some], *given, span_us, before=against, mild=mild)
+        which = listed, numbers[0, some], windows, rays, width_px
+        seen, own_rays = tracer.pilot_rays(*which, span_us=span_us, before=against, mild=mild)
         first = first.with_pairs(some, seen)
     # known shadows [window, site]: shapes that hide light in the first window do so in those that follow
     shadows, given_shadows = np.zeros((count, sites.size), np.uint32), (rays, width_px, wanted, mild)
