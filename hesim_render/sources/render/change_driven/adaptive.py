@@ -36,8 +36,8 @@ _NOTHING = np.float32(1e-3)
 
 def pixels_at_once(role: Role, has_ticks: bool, apart: bool) -> int:
     """Number of pixels that are processed at a time, to bound memory; no value depends on it. The 32 pilot rays of each
-    are traced at once, in arrays of a power of two, as Dr.Jit's memory is. A block of ticks has fewer windows, so that
-    twice as many pixels that have neighbours take less memory; beside those that lie apart, others are looked at too.
+    are traced at once, in arrays of a power of two, as Dr.Jit's memory is. A block of ticks has fewer windows, so
+    that twice as many pixels fit; not where event pixels lie apart, as sensors with many of them need the memory.
     """
     return rays_at_once() // (16 if has_ticks and role == "events" and not apart else 32)
 

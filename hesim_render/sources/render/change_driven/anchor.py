@@ -81,7 +81,7 @@ class Anchor:
         self._windows = Windows(*(np.array([time]) for time in span_us))
         near_us, is_long = None, False
         if block_us is not None:
-            # what is met within an interval is known of windows within it, such as the anchor
+            # rays look for objects in the boxes of this interval, so that it has to hold the anchor
             near_us, length_us = (min(span_us[0], block_us[0]), max(span_us[1], block_us[1])), block_us[1] - block_us[0]
             if is_short(renderer, length_us):
                 # the last block may go on behind the next anchor

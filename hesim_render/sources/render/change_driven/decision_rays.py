@@ -61,7 +61,7 @@ class DecisionRays(PacketTracer):
         """
         out, moments, key = EdgeFit.empty(pixel.size), self._moments(windows, None), self._key(stream)
         footprint, packets = dr.opaque(jit().Float, footprint_px), np.full(pixel.size, samples // PACKET)
-        # a line takes as many rays again, and the values of all of them are held
+        # where there is a line, as many rays again are traced, and the values of all of them are held at once
         for part, _, known in in_blocks(packets, self._block_rays // (2 * PACKET), None, None, shadows):
             lanes = pixel[part], window[part].astype(np.uint32), np.zeros(pixel[part].size, np.uint32)
             inputs = (

@@ -197,7 +197,8 @@ def take_pilot(
     else:
         some, first = every, anchored.flux
         if anchored.is_long and anchored.tells(span_us) and knows:
-            # what nothing comes near for much longer shows here what it does in the anchor
+            # what nothing comes near for much longer shows here what it does in the anchor; one site at least is
+            # traced, as kernels need a ray
             some = np.flatnonzero(first.met) if first.met.any() else every[:1]
         own_place, own_count = np.zeros(sites.size, np.int64), some.size
         own_place[some] = np.arange(some.size)
