@@ -1,7 +1,10 @@
 """The renderer that a run asks for, or that its scene needs."""
 
+from itertools import count
+
 import numpy as np
 
+from hesim_render.core.workers import Workers
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.camera import View
 from hesim_render.sources.render.change_driven.flux import QUALITY, ChangeDrivenFlux
@@ -23,6 +26,7 @@ def scene_renderer(
     quality: float | None = None,
     samples: int | None = None,
     exact: bool = False,
+    workers: Workers | None = None,
 ) -> SceneRenderer:
     """The renderer of a scene: change-driven, unless the exact mode is asked for or the scene needs it.
 
@@ -30,6 +34,7 @@ def scene_renderer(
     ----------
     scene : with lights in absolute units (`in_absolute_light`).
     sensor, seed, quality, samples, exact : as for `simulate`.
+    workers : processes that render in the default mode, from `part_worker.start`; None renders in this one.
 
     Raises
     ------
@@ -39,10 +44,14 @@ def scene_renderer(
     window_us = sensor.spec.evs.window_us if sensor.spec.evs is not None else 1.0
     because: str | None = None
     if not exact and samples is None:
-        wanted = QUALITY if quality is None else quality
+        wanted, parts = QUALITY if quality is None else quality, count()
         try:
             return flickering(
-                scene, lambda part, light: ChangeDrivenFlux(part, sensor, wanted, seed=seed, light=light), window_us
+                scene,
+                lambda part, light: ChangeDrivenFlux(
+                    part, sensor, wanted, seed=seed, light=light, workers=workers, part=next(parts)
+                ),
+                window_us,
             )
         except NeedsExactMode as error:
             if quality is not None:

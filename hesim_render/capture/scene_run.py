@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from hesim_render.capture.error_meter import ErrorMeter, stated_verdict
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.overheads import with_overheads
+from hesim_render.capture.overheads import with_overheads, with_workers
 from hesim_render.capture.run_settings import Noise, RunSettings
 from hesim_render.core.device import dr
 from hesim_render.core.errors import SpecError, TooLongError
@@ -31,10 +31,19 @@ class SceneRun:
     noise : models of frame pixels and event pixels.
     settings : of the run.
     progress : called with (done, total, what).
+    workers : number of processes that render.
     """
 
-    def __init__(self, renderer: SceneRenderer, noise: Noise, settings: RunSettings, progress: Progress | None) -> None:
+    def __init__(
+        self,
+        renderer: SceneRenderer,
+        noise: Noise,
+        settings: RunSettings,
+        progress: Progress | None,
+        workers: int = 1,
+    ) -> None:
         self._renderer, self._noise, self._settings, self._progress = renderer, noise, settings, progress
+        self._workers = workers
         # a capture knows what the run asks for; this one takes nothing
         self._demand = Capture(renderer, renderer.sensor, *noise, settings.duration_us, settings.seed).demand
         self._errors: dict[str, ErrorMeter] = {}
@@ -62,7 +71,7 @@ class SceneRun:
         expected: Estimate | None = None
         if is_shown or on_estimate is not None or most is not None:
             expected = with_overheads(
-                renderer.estimate(self._demand, report), renderer.sensor, self._demand,
+                with_workers(renderer.estimate(self._demand, report), self._workers), renderer.sensor, self._demand,
                 audited=self._is_audited, rests=renderer.is_static,
             )  # fmt: skip
         if expected is not None and on_estimate is not None:

@@ -58,7 +58,9 @@ _CAVE = re.compile(r".+_ms_\d\d\.png")
 _SIMULATED = frozenset({"--sensor", "--duration", "--roi", "--seed", "--clean", "--without"})
 _RENDERED = frozenset({"--quality", "--exact", "--samples", "--truth", "--truth-every-us"})
 _TAKEN: Mapping[InputKind, frozenset[str]] = {
-    InputKind.scene: _SIMULATED | _RENDERED | {"--set", "--live", "--allow-outside", "--framing", "--look"},
+    InputKind.scene: _SIMULATED
+    | _RENDERED
+    | {"--set", "--live", "--allow-outside", "--framing", "--look", "--workers"},
     InputKind.video: _SIMULATED | {"--set", "--live"},
     InputKind.cube: _SIMULATED | {"--set", "--live"},
     InputKind.run: _SIMULATED | _RENDERED | {"--set", "--allow-outside"},

@@ -105,6 +105,10 @@ def simulate(
             "--live", help="show the run in rerun while it goes on; without a display, in OUT/live.rrd", hidden=True
         ),
     ] = False,
+    workers: Annotated[
+        int | None,
+        typer.Option(help="processes that render, each some rows of the sensor; the recording is the same (default 1)"),
+    ] = None,
     yes: Yes = False,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
@@ -125,7 +129,7 @@ def simulate(
         "--sensor": sensor, "--duration": duration, "--roi": roi, "--seed": seed, "--quality": quality,
         "--exact": exact, "--samples": samples, "--truth": truth, "--truth-every-us": truth_every_us, "--set": set_,
         "--clean": clean, "--without": without, "--allow-outside": allow_outside, "--scene": scene_file,
-        "--framing": framing, "--look": look, "--live": live,
+        "--framing": framing, "--look": look, "--live": live, "--workers": workers,
     })  # fmt: skip
     if duration is not None:
         check_duration(duration)
@@ -154,6 +158,7 @@ def simulate(
     else:
         inputs = Inputs(given, sensor, keys, sensor_keys, roi, allow_outside)
         if kind is InputKind.scene:
+            rendered |= _given(workers=workers)
             show_recording(console, _scene(console, inputs, place, **limits, **common, **rendered))
         else:
             _pictures(console, kind, inputs, place, {**limits, **common})

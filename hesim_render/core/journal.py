@@ -77,6 +77,7 @@ class Journal:
     Attributes
     ----------
     path : the file, from `journal_of`. It appears with the first result.
+    run : as given, as plain values of JSON.
     count : number of results of an earlier run, those of `others` included.
 
     Raises
@@ -97,7 +98,7 @@ class Journal:
     ) -> None:
         self.path, self._shared, self._begin_s = journal_of(target), shared, time.monotonic() + after_s
         self._is_off, self._stays = False, stays
-        self._run = json.loads(json.dumps({"format": _FORMAT, **run}, default=str))
+        self.run = json.loads(json.dumps({"format": _FORMAT, **run}, default=str))
         #: File, first byte, length and checksum of each result.
         self._places: dict[bytes, tuple[Path, int, int, int]] = {}
         self._file: BinaryIO | None = None
@@ -121,8 +122,8 @@ class Journal:
                 before = None
             if not isinstance(before, dict):
                 before = {}
-            if before != self._run:
-                changed = [name for name in {**self._run, **before} if before.get(name) != self._run.get(name)]
+            if before != self.run:
+                changed = [name for name in {**self.run, **before} if before.get(name) != self.run.get(name)]
                 if not overwrite and before:
                     raise OutputError(
                         f"{target}: the interrupted run at this place differs in {', '.join(changed)}; "
@@ -158,7 +159,7 @@ class Journal:
         """Places of the results in another journal of this run."""
         try:
             with path.open("rb") as file:
-                if json.loads(file.readline(_LONGEST_LINE)) == self._run:
+                if json.loads(file.readline(_LONGEST_LINE)) == self.run:
                     return dict(_entries(path, file))
         except (OSError, ValueError):
             pass
@@ -239,7 +240,7 @@ class Journal:
                 if self._file is None:
                     return
                 self._file.truncate(0)
-                self._file.write(json.dumps(self._run).encode() + b"\n")
+                self._file.write(json.dumps(self.run).encode() + b"\n")
             checksum = zlib.crc32(data)
             begin = self._file.seek(0, 2) + _HEAD.size
             self._file.write(_HEAD.pack(key, len(data), checksum) + data)

@@ -1,6 +1,7 @@
 """Data of the default source: flux with both halves and its error, pixels at rest, and counts of the work done."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,3 +128,8 @@ class Counts:
     rays: int = 0
     pairs: int = 0
     values: int = 0
+
+    @classmethod
+    def sum(cls, parts: "Sequence[Counts]") -> "Counts":
+        """Work of several renderers."""
+        return cls(*(sum(getattr(part, each.name) for part in parts) for each in fields(cls)))

@@ -5,9 +5,11 @@ have two of them, at both ends of the block. Only knots are held, so that a bloc
 windows.
 """
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +43,7 @@ class Blocks:
     ----------
     alive : places of the pixels that may change.
     own : places of these among the pixels that `take` gives: all of them, or all pixels, where few are constant.
+    count : number of pixels that `take` gives.
     base : [1, n], flux of all pixels in the anchor of the first window.
     """
 
@@ -60,8 +63,9 @@ class Blocks:
         if kept_pixels == pixel.size:
             # few are constant
             self.own, known = self.alive, self.base
+        self.count = known.error.shape[1]
         # all pixels that may change, or nearly only these: their bands and pilots go on
-        if known.error.shape[1] == kept_pixels:
+        if self.count == kept_pixels:
             pilots = [pilot for _, pilot in kept]
             self._bands = [band for band, _ in kept]
         else:
@@ -74,6 +78,11 @@ class Blocks:
         #: Window whose flux is `_last`.
         self._time: tuple[float, float] | None = None
         self._last = known
+
+    def through(self, blocks: Iterable[Block]) -> Iterator[tuple[Block, "BlockFlux"]]:
+        """Successive blocks, and what `take` gives for each."""
+        for block in blocks:
+            yield block, self.take(block)
 
     def take(self, block: Block) -> "BlockFlux":
         """Flux of the pixels that may change; with that of the others where few are constant."""
@@ -182,47 +191,63 @@ class Knots:
         values = tuple(values[window, pixel] for values in flux.arrays)
         return cls(first, window.astype(np.int16), values, centre_us)
 
-    def places(self, window: int, before: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-        """Last knot of each pixel up to a window, [n].
-
-        Parameters
-        ----------
-        window : number of the window.
-        before : the same of the window before it, if it is known.
-        """
-        if before is not None:
-            # a pixel moves on by one knot where the next one is reached; the last knot of all has no next one
-            following = np.minimum(before + 1, self.window.size - 1)
-            moves = (before + 1 < self.first[1:]) & (self.window[following] <= window)
-            return before + moves
+    def places(self, window: int) -> NDArray[np.int64]:
+        """Last knot of each pixel up to a window, [n]."""
         # knots in order of pixel and window; one before the first knot that is later
         count = self.centre_us.size
         key = np.repeat(np.arange(self.first.size - 1), np.diff(self.first)) * count + self.window
         return np.searchsorted(key, np.arange(self.first.size - 1) * count + window, side="right") - 1
 
-    def at(self, window: int, low: NDArray[np.int64]) -> Flux:
-        """Flux in one window, [1, n]; 0 where no knot is at or after it.
 
-        Parameters
-        ----------
-        window : number of the window.
-        low : last knot of each pixel up to it.
-        """
-        here, has_next = self.window[low], low + 1 < self.first[1:]
+class _Course:
+    """Flux of pixels on straight lines from knot to knot; quick for windows one after the other.
+
+    Parameters
+    ----------
+    knots : of the pixels.
+    """
+
+    #: Window of the next knot where there is none.
+    _NEVER = np.iinfo(np.int16).max
+
+    def __init__(self, knots: Knots) -> None:
+        self._knots, self._at = knots, -2
+        size = knots.first.size - 1
+        #: Last knot of each pixel, window of the next one, and the windows of both as one number, [n].
+        self._low, self._next = np.zeros(size, np.int64), np.zeros(size, np.int16)
+        self._pair = np.zeros(size, np.intp)
+        #: Values at the last knot, and what they change by up to the next one, [3, n].
+        self._start, self._change = np.zeros((3, size), np.float32), np.zeros((3, size), np.float32)
+
+    def _pass(self, place: NDArray[np.int64], low: NDArray[np.int64]) -> None:
+        """Note the last knot of some pixels."""
+        knots = self._knots
+        has_next = low + 1 < knots.first[place + 1]
         high = low + has_next
+        self._low[place] = low
+        self._next[place] = np.where(has_next, knots.window[high], self._NEVER)
+        self._pair[place] = knots.window[low].astype(np.intp) * knots.centre_us.size + knots.window[high]
+        for values, start, change in zip(knots.values, self._start, self._change, strict=True):
+            start[place] = begin = values[low]
+            change[place] = values[high] - begin
+
+    def at(self, window: int) -> NDArray[np.float32]:
+        """Half A, half B and error in one window, [3, n]; 0 where no knot is at or after it."""
+        centre = self._knots.centre_us
+        if window == self._at + 1:
+            # most pixels stay between the same two knots; a pixel moves on by one where the next one is reached
+            place = np.flatnonzero(self._next <= window)
+            self._pass(place, self._low[place] + 1)
+        elif window != self._at:
+            self._pass(np.arange(self._low.size), self._knots.places(window))
+        self._at = window
         # how far the window is on the way from one knot to the next, by the windows of both; 0 from a knot to itself
-        centre = self.centre_us
         begin, span = centre[:, None], centre - centre[:, None]
         way = ((centre[window] - begin) / np.where(span > 0, span, np.inf)).astype(np.float32)
-        part = way.ravel()[here.astype(np.int64) * centre.size + self.window[high]]
-        nothing = np.flatnonzero((here != window) & ~has_next)
-        interpolated = []
-        for values in self.values:
-            start = values[low]
-            value = start + part * (values[high] - start)
-            value[nothing] = 0
-            interpolated.append(value[None])
-        return Flux(*interpolated)
+        result = self._start + way.ravel()[self._pair] * self._change
+        ended = np.flatnonzero(self._next == self._NEVER)
+        result[:, ended[self._pair[ended] // centre.size != window]] = 0
+        return result
 
 
 class BlockFlux:
@@ -235,15 +260,23 @@ class BlockFlux:
     """
 
     def __init__(self, size: int, parts: list[tuple[NDArray[np.int64], Knots]]) -> None:
-        self._size, self._parts = size, parts
-        self._window, self._low = -2, [np.empty(0, np.int64)] * len(parts)
+        self._size, self._parts, self._courses = size, parts, [_Course(knots) for _, knots in parts]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """From process to process without what was computed for windows."""
+        return BlockFlux, (self._size, self._parts)
+
+    @classmethod
+    def joined(cls, lists: "Sequence[BlockFlux]") -> "BlockFlux":
+        """Of several lists of pixels, one after the other."""
+        begins = np.cumsum([0, *(each._size for each in lists)])
+        begun = zip(begins[:-1].tolist(), lists, strict=True)
+        return cls(int(begins[-1]), [(begin + place, knots) for begin, each in begun for place, knots in each._parts])
 
     def at(self, window: int) -> Flux:
         """Flux in one window, [1, size]; quick for windows one after the other."""
-        out, follows = Flux.zeros(1, self._size), window == self._window + 1
-        for number, (place, knots) in enumerate(self._parts):
-            low = knots.places(window, self._low[number] if follows else None)
-            out.put(place, knots.at(window, low))
-            self._low[number] = low
-        self._window = window
-        return out
+        out = np.zeros((3, self._size), np.float32)
+        for (place, _), course in zip(self._parts, self._courses, strict=True):
+            for whole, values in zip(out, course.at(window), strict=True):
+                whole[place] = values
+        return Flux(*out[:, None])

@@ -8,6 +8,7 @@ time only: they would come out the same again.
 
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +19,7 @@ from hesim_render.core.errors import RangeError
 from hesim_render.core.host_arrays import from_host
 from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress
+from hesim_render.core.workers import Workers
 from hesim_render.mosaic.schedule import Block, blocks_of_run
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.protocol import AuditableFlux, Sample
@@ -30,6 +32,7 @@ from hesim_render.sources.render.change_driven.foresight import Foresight
 from hesim_render.sources.render.change_driven.one_window import render_one_window
 from hesim_render.sources.render.change_driven.references import References
 from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
+from hesim_render.sources.render.change_driven.row_shares import RowShares, SharedBlocks
 from hesim_render.sources.render.change_driven.sample_instants import MotionClock
 from hesim_render.sources.render.change_driven.shared_tracer import SharedTracer
 from hesim_render.sources.render.change_driven.tuning import TUNING, Tuning
@@ -39,6 +42,7 @@ from hesim_render.sources.renderer import Demand, Estimate
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.waveform import Waveform
 
+_NONE = np.empty(0, np.int64)
 #: Default error of the render, as a fraction of the sensor's noise.
 QUALITY = 0.5
 
@@ -60,6 +64,8 @@ class ChangeDrivenFlux:
         windows are weighted with the waveform. The flux under the flickering light is this mean times the waveform's.
     progress : called with the number of rays traced so far, after each block.
     tuning : constants of the method.
+    workers : processes that render, from `part_worker.start`; None renders here.
+    part : number of this part of the light, by which workers know it.
 
     Attributes
     ----------
@@ -87,6 +93,8 @@ class ChangeDrivenFlux:
         light: Waveform | None = None,
         progress: Callable[[int], None] | None = None,
         tuning: Tuning = TUNING,
+        workers: Workers | None = None,
+        part: int = 0,
     ) -> None:
         if not 0 < quality < float("inf"):
             raise RangeError("quality", quality, "a part of the sensor's noise, above 0")
@@ -99,6 +107,12 @@ class ChangeDrivenFlux:
         self._renderer = AdaptiveRenderer(tracer, noise, quality, tuning.at(quality), self._clock)
         self._index, self._references = self._renderer.index, References(self._renderer)
         self.foresight = Foresight(self._renderer, self._is_dark)
+        self._shares: RowShares | None = None
+        if workers is not None and not self._is_dark:
+            given = {"quality": quality, "seed": seed, "light": light, "tuning": tuning}
+            self._shares = RowShares(
+                workers, part, self.sensor, self._report, {"scene": scene, "sensor": sensor, **given}
+            )
 
     # ---- as a `SceneRenderer` ---------------------------------------------------------------------
 
@@ -134,16 +148,19 @@ class ChangeDrivenFlux:
     def go_on(self, journal: Journal, part: int = 0) -> None:
         """See `Tracer.go_on`."""
         self._tracer.go_on(journal, part)
+        if self._shares is not None:
+            self._shares.go_on(journal, part)
 
     @property
     def counts(self) -> Counts:
         """Work done so far."""
-        return self._renderer.counts
+        own = self._renderer.counts
+        return own if self._shares is None else Counts.sum([own, self._shares.counts])
 
     @property
     def rays_traced(self) -> int:
         """Number of rays traced so far, pilot passes included."""
-        return self._tracer.rays_done
+        return self._tracer.rays_done + (0 if self._shares is None else self._shares.rays_done)
 
     @property
     def _is_dark(self) -> bool:
@@ -173,12 +190,21 @@ class ChangeDrivenFlux:
         begin, end = (np.broadcast_to(np.asarray(t, dtype=np.float64), pixels.shape) for t in (begin_us, end_us))
         if not np.all(end >= begin):
             raise RangeError("end_us - begin_us", float(np.min(end - begin)), "0 or more")
-        flux = Flux.zeros(1, pixels.size)
+        halves = np.zeros((2, pixels.size), np.float32)
         if not self._is_dark and pixels.size:
-            render_one_window(self._renderer, pixels, begin, end, "any", flux)
-        half_a, half_b = from_host(types.Float, flux.half_a[0]), from_host(types.Float, flux.half_b[0])
+            given = pixels, begin, end
+            halves = self.halves(*given) if self._shares is None else self._shares.of_pixels("halves", *given)
+        half_a, half_b = (from_host(types.Float, half) for half in halves)
         require_finite(half_a, half_b, self._scene, self.sensor.layout, pixels)
         return half_a, half_b
+
+    def halves(
+        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """As `mean_flux`, on the host, [2, n]; rendered here."""
+        flux = Flux.zeros(1, pixel.size)
+        render_one_window(self._renderer, pixel, begin_us, end_us, "any", flux)
+        return np.concatenate([flux.half_a, flux.half_b])
 
     # ---- for the forecast -------------------------------------------------------------------------
 
@@ -218,6 +244,9 @@ class ChangeDrivenFlux:
         """See `AuditableFlux.reference_flux`: a stream of random numbers of its own."""
         if self._is_dark or pixel.size == 0:
             return np.zeros((2, pixel.size))
+        if self._shares is not None:
+            others = {"quality": quality, "events": events}
+            return self._shares.of_pixels("reference_flux", pixel, begin_us, end_us, **others)
         return self._references.values(self._index[pixel], begin_us, end_us, quality, "events" if events else "any")
 
     def reference_changes(
@@ -232,6 +261,9 @@ class ChangeDrivenFlux:
         """See `AuditableFlux.reference_changes`."""
         if self._is_dark or pixel.size == 0:
             return np.zeros((2, *needed.shape))
+        if self._shares is not None:
+            others = {"base": base, "quality": quality}
+            return self._shares.of_pixels("reference_changes", pixel, begin_us, end_us, needed, **others)
         return self._references.changes(self._index[pixel], begin_us, end_us, needed, base, quality)
 
     # ---- many windows -----------------------------------------------------------------------------
@@ -240,16 +272,19 @@ class ChangeDrivenFlux:
         """See `FluxSource.flux_of_blocks`."""
         types = jit()
         pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
-        work: Blocks | None = None
-        for block in blocks:
-            if pixels.size == 0 or self._is_dark:
-                alive = own = np.empty(0, np.int64)
-                base, flux = Flux.zeros(1, pixels.size), BlockFlux(0, [])
-            else:
-                work = work or Blocks(self._renderer, pixels, block)
-                flux, alive, own, base = work.take(block), work.alive, work.own, work.base
+        every = iter(blocks)
+        if (first := next(every, None)) is None:
+            return
+        every, alive, own, base = chain([first], every), _NONE, _NONE, Flux.zeros(1, pixels.size)
+        rendered: Iterator[tuple[Block, BlockFlux]]
+        if pixels.size == 0 or self._is_dark:
+            rendered = ((block, BlockFlux(0, [])) for block in every)
+        else:
+            work = self._blocks(pixels, first)
+            rendered, alive, own, base = work.through(every), work.alive, work.own, work.base
+        for block, flux in rendered:
             for window in np.flatnonzero(block.wanted):
-                self.counts.values += pixels.size
+                self._renderer.counts.values += pixels.size
                 # constant pixels keep the flux of the anchor; those that may change have that of this window
                 values = [part[0].copy() for part in base.arrays]
                 for whole, part in zip(values, flux.at(int(window)).arrays, strict=True):
@@ -259,3 +294,22 @@ class ChangeDrivenFlux:
                 yield Sample(half_a, half_b, values[2])
             # the next block is rendered without this one's knots in memory
             del flux
+
+    def blocks(self, pixel: NDArray[np.uint32], first: Block) -> Blocks:
+        """Event pixels [n] through blocks that follow a first one; rendered here."""
+        return Blocks(self._renderer, pixel, first)
+
+    def _blocks(self, pixel: NDArray[np.uint32], first: Block) -> Blocks | SharedBlocks:
+        """See `blocks`; by the workers, where there are any."""
+        if self._shares is None:
+            return self.blocks(pixel, first)
+        work, still = SharedBlocks(self._shares, pixel, first), self._renderer.still("events")
+        # the workers know which pixels are constant; the audit asks here
+        place = np.setdiff1d(np.arange(pixel.size), work.alive, assume_unique=True)
+        still.put(pixel[place], work.base.at(place))
+        return work
+
+    def _report(self) -> None:
+        """Report the rays of all processes."""
+        if self._tracer.progress is not None:
+            self._tracer.progress(self.rays_traced)
