@@ -9,9 +9,10 @@ from hesim_render.capture.run_settings import TERMS, RunOptions, RunSettings, no
 from hesim_render.capture.scene_renderer import camera_used, scene_renderer
 from hesim_render.capture.scene_run import SceneRun
 from hesim_render.core import backend
-from hesim_render.core.errors import ConflictError, RangeError
+from hesim_render.core.errors import ConflictError
 from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress, expect, shown
+from hesim_render.core.workers import require_processes
 from hesim_render.mosaic.schedule import require_countable
 from hesim_render.recording.recording import Recording, warn_of_exposure
 from hesim_render.recording.writer import RecordingWriter
@@ -23,9 +24,6 @@ from hesim_render.sources.render.renderer import SceneRenderer
 from hesim_render.sources.renderer import Estimate
 from hesim_render.sources.scene import Scene, scene_and_sensor
 from hesim_render.specs.lens import LENS_TERMS
-
-#: Largest number of worker processes of a run.
-MOST_WORKERS = 64
 
 
 def simulate(
@@ -105,8 +103,7 @@ def simulate(
     scene, sensor = scene_and_sensor(scene, sensor)
     run_settings = RunSettings(**settings)
     duration_us, seed = run_settings.duration_us, run_settings.seed
-    if not isinstance(workers, int) or not 1 <= workers <= MOST_WORKERS:
-        raise RangeError("workers", workers, f"a whole number of processes, 1 to {MOST_WORKERS}")
+    require_processes(workers)
     if workers > 1 and renderer is not None:
         raise ConflictError("workers", workers, "a renderer that is given renders in this process; give no workers")
     if workers > 1 and (run_settings.exact or run_settings.samples is not None):

@@ -107,7 +107,9 @@ def simulate(
     ] = False,
     workers: Annotated[
         int | None,
-        typer.Option(help="processes that render, each some rows of the sensor; the recording is the same (default 1)"),
+        typer.Option(
+            help="processes that render, each some rows of the sensor; the recording is the same (default 1)", hidden=True
+        ),
     ] = None,
     yes: Yes = False,
     overwrite: Overwrite = False,

@@ -15,9 +15,11 @@ from types import TracebackType
 from typing import Any, NamedTuple
 
 from hesim_render.core.child import child_environment, python_command, with_package
-from hesim_render.core.errors import BackendError
+from hesim_render.core.errors import BackendError, RangeError
 
 _GRACE_S = 2.0
+#: Largest number of processes.
+_MOST = 64
 
 
 class Ticket(NamedTuple):
@@ -132,6 +134,18 @@ class Workers:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         self.close()
+
+
+def require_processes(count: int) -> None:
+    """Check a number of processes.
+
+    Raises
+    ------
+    RangeError
+        If it is not whole, or out of range.
+    """
+    if not isinstance(count, int) or not 1 <= count <= _MOST:
+        raise RangeError("workers", count, f"a whole number of processes, 1 to {_MOST}")
 
 
 def serve(answer: Callable[..., Any]) -> None:

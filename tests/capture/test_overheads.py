@@ -7,7 +7,7 @@ import pytest
 
 import hesim_render as hr
 from hesim_render.capture import overheads
-from hesim_render.capture.overheads import noise_seconds, with_overheads
+from hesim_render.capture.overheads import noise_seconds, with_overheads, with_workers
 from hesim_render.mosaic.schedule import Block, BlockSample, Exposure
 from hesim_render.sources.renderer import Demand, Estimate
 
@@ -72,6 +72,24 @@ def test_an_audit_costs_rays_at_the_speed_of_the_picture_and_traces():
 def test_frames_and_the_start_count():
     assert told("reference-bayer", frames=7) - told("reference-bayer") == pytest.approx(7 * (0.02 + 60e-9 * 64 * 48))
     assert told("reference-bayer", windows=0.0) == pytest.approx(RAYS.seconds + 0.5)
+
+
+def test_several_processes_divide_what_the_host_does(monkeypatch):
+    """Kernels use all processors already, so that more of them leave more to be divided; each process has memory."""
+    one = replace(RAYS, seconds=40.0, held_bytes=2e8)
+    seconds = {}
+    for count in (2, 16):
+        monkeypatch.setattr(overheads, "processors", lambda count=count: count)
+        for workers in (1, 2, 5, 64):
+            told_of = with_workers(one, workers)
+            seconds[count, workers] = told_of.seconds
+            assert told_of.rays == one.rays
+            assert told_of.peak_bytes == (7e8 if workers == 1 else 4e8 + workers * 5e8 + 2e8)
+    assert seconds[2, 1] == seconds[16, 1] == 40
+    assert seconds[2, 2] == pytest.approx(2.5 + 40 * 1.1 * (0.4 + 0.6 / 2))
+    assert seconds[16, 5] == pytest.approx(2.5 + 40 * 1.1 * (0.05 + 0.95 / 5))
+    # more processes than processors divide nothing further
+    assert seconds[2, 64] == seconds[2, 2] and seconds[16, 64] == pytest.approx(2.5 + 44 * (0.05 + 0.95 / 16))
 
 
 class Stopped(Exception):

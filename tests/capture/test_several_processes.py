@@ -17,7 +17,7 @@ MAINS = {"light.waveform": {"type": "mains", "frequency_hz": 50, "depth": 0.4}}
 #: scene under two lights, and light that bounces.
 RUNS = {
     "asynchronous": ("rotating-star", {}, "davis346", (52, 44, 130, 70), 0.011),
-    "ticks": ("camera-sweep", {}, "gen2", (48, 40, 1400, 900), 0.012),
+    "ticks": ("camera-sweep", {}, "gen2", (192, 160, 1600, 1000), 0.012),
     "flicker": ("colorchecker", MAINS, "gen2", (32, 48, 1200, 800), 0.008),
     "paths": ("glass-and-metal", {}, "davis346", (16, 34, 170, 110), 0.002),
 }

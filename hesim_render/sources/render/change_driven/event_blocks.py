@@ -199,7 +199,7 @@ class Knots:
         return np.searchsorted(key, np.arange(self.first.size - 1) * count + window, side="right") - 1
 
 
-class _Course:
+class _BetweenKnots:
     """Flux of pixels on straight lines from knot to knot; quick for windows one after the other.
 
     Parameters
@@ -260,7 +260,7 @@ class BlockFlux:
     """
 
     def __init__(self, size: int, parts: list[tuple[NDArray[np.int64], Knots]]) -> None:
-        self._size, self._parts, self._courses = size, parts, [_Course(knots) for _, knots in parts]
+        self._size, self._parts, self._between = size, parts, [_BetweenKnots(knots) for _, knots in parts]
 
     def __reduce__(self) -> tuple[Any, ...]:
         """From process to process without what was computed for windows."""
@@ -276,7 +276,7 @@ class BlockFlux:
     def at(self, window: int) -> Flux:
         """Flux in one window, [1, size]; quick for windows one after the other."""
         out = np.zeros((3, self._size), np.float32)
-        for (place, _), course in zip(self._parts, self._courses, strict=True):
-            for whole, values in zip(out, course.at(window), strict=True):
+        for (place, _), own in zip(self._parts, self._between, strict=True):
+            for whole, values in zip(out, own.at(window), strict=True):
                 whole[place] = values
         return Flux(*out[:, None])
