@@ -68,7 +68,7 @@ def test_a_run_goes_on_with_what_its_workers_have_rendered(tmp_path, monkeypatch
 
     monkeypatch.setattr(Journal, "keep", counted)
     monkeypatch.setattr(RowShares, "answer", stopped)
-    for run, target in enumerate((tmp_path / "whole", out, out)):  # noqa: B007, the patches read it
+    for run, target in enumerate((tmp_path / "whole", out, out)):
         if run == 1:
             answers = 0
             with pytest.raises(KeyboardInterrupt):
@@ -97,7 +97,7 @@ def test_a_worker_that_dies_ends_the_run_and_leaves_nothing(tmp_path, monkeypatc
 
 @pytest.mark.parametrize("workers", [0, -2, 65, 1.5, "2"])
 def test_numbers_of_workers_are_checked(workers):
-    with pytest.raises(RangeError, match="workers is .* expected a whole number of processes, 1 to 64"):
+    with pytest.raises(RangeError, match=r"workers is .* expected a whole number of processes, 1 to 64"):
         record("asynchronous", workers=workers)
 
 
