@@ -108,7 +108,8 @@ def simulate(
     workers: Annotated[
         int | None,
         typer.Option(
-            help="processes that render, each some rows of the sensor; the recording is the same (default 1)", hidden=True
+            help="processes that render, each its own rows of the sensor; the recording is the same (default 1)",
+            hidden=True,
         ),
     ] = None,
     yes: Yes = False,
