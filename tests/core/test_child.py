@@ -81,6 +81,7 @@ def test_no_other_place_starts_python():
     assert found == {
         "core/child.py": {"sys.executable"},
         "core/backend.py": {"subprocess.run"},
+        "core/workers.py": {"subprocess.Popen", "multiprocessing"},
         "benchmark/local.py": {"subprocess.Popen"},
         "benchmark/peer_run.py": {"subprocess.Popen"},
     }
