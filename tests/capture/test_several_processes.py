@@ -4,12 +4,15 @@ import json
 import os
 import signal
 
+import numpy as np
 import pytest
 
 import hesim_render as hr
 from hesim_render.core.errors import BackendError, ConflictError, RangeError
 from hesim_render.core.journal import Journal
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
+from hesim_render.sources.render.change_driven.part_worker import start
 from hesim_render.sources.render.change_driven.row_shares import RowShares, SharedBlocks
 
 MAINS = {"light.waveform": {"type": "mains", "frequency_hz": 50, "depth": 0.4}}
@@ -49,6 +52,25 @@ def test_the_recording_is_that_of_one_process(name, tmp_path, monkeypatch):
     assert manifest == stated
     # rows beside those of another worker are looked at twice
     assert rays <= more < 2.5 * rays
+
+
+def test_what_rests_and_how_many_rays_were_traced_is_known_here():
+    """The audit asks this process which pixels are constant; progress counts the rays of all processes."""
+    scene, _, sensor, region, _ = RUNS["asynchronous"]
+    lamp = {"type": "point", "illuminant": "D65", "illuminance_lux": 1700, "position_m": [0.1, 0.2, 3]}
+    scene = hr.load_scene(scene, {"light": lamp, "camera.fit_margin": 0.1})
+    cropped, told = hr.load_sensor(sensor).crop(*region), []
+    with start(2) as workers:
+        one = ChangeDrivenFlux(scene, cropped, seed=3)
+        two = ChangeDrivenFlux(scene, cropped, seed=3, workers=workers, progress=told.append)
+        pixels = cropped.layout.evs_pixel.ravel()[5:]
+        for flux in (one, two):
+            for _ in flux.flux_of_blocks(pixels, flux.sample_blocks(30, 0, 1500)):
+                pass
+        rests = one.still_pixels(pixels)
+        assert 0 < rests.sum() < rests.size
+        np.testing.assert_array_equal(two.still_pixels(pixels), rests)
+        assert told == sorted(told) and len(told) >= 4 and told[-1] == two.rays_traced > one.rays_traced
 
 
 def test_a_run_goes_on_with_what_its_workers_have_rendered(tmp_path, monkeypatch):
