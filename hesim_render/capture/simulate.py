@@ -1,5 +1,6 @@
 """Render a scene, expose a sensor to it, and record frames and events."""
 
+import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -9,7 +10,7 @@ from hesim_render.capture.run_settings import TERMS, RunOptions, RunSettings, no
 from hesim_render.capture.scene_renderer import camera_used, scene_renderer
 from hesim_render.capture.scene_run import SceneRun
 from hesim_render.core import backend
-from hesim_render.core.errors import ConflictError
+from hesim_render.core.errors import ConflictError, HesimWarning
 from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress, expect, shown
 from hesim_render.core.workers import require_processes
@@ -132,7 +133,13 @@ def simulate(
             stated["light_level"] = level.as_dict()
         stated |= {"backend": backend.select().label, "camera": camera_used(source.view)}
         # the estimate may end the run: nothing is written before it
-        run = SceneRun(source, noise, run_settings, report, 1 if processes is None else workers)
+        if workers > 1 and source.samples is not None:
+            warnings.warn(
+                "the scene needs the exact mode, which renders in one process: --workers (workers) changes nothing",
+                HesimWarning,
+                stacklevel=2,
+            )
+        run = SceneRun(source, noise, run_settings, report, workers if source.samples is None else 1)
         expected = run.expect(on_estimate)
         if expected is not None:
             expect(report, expected.seconds)

@@ -123,6 +123,12 @@ def test_numbers_of_workers_are_checked(workers):
         record("asynchronous", workers=workers)
 
 
+def test_a_scene_that_needs_the_exact_mode_says_that_workers_change_nothing():
+    sensor = hr.load_sensor("reference-bayer", {"lens.veiling_glare": 0.3}).crop(16, 12)
+    with pytest.warns(hr.HesimWarning, match="needs the exact mode, which renders in one process"):
+        hr.simulate(hr.load_scene("colorchecker"), sensor, duration_s=0.02, workers=2, progress=False)
+
+
 def test_workers_render_in_the_default_mode_alone():
     with pytest.raises(ConflictError, match="the exact mode renders in one process"):
         record("asynchronous", workers=2, samples=8)
