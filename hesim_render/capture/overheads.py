@@ -27,9 +27,10 @@ _AUDIT_RAYS, _MOST_TICK_RAYS, _MOST_ASYNCHRONOUS_RAYS, _AUDIT_PART, _AUDIT_S = 8
 #: `pendulum` and `robot-arm` on `davis346`, `gen2` and `reference-mono`, 5 to 20 ms.
 _TICK_TRACES, _ASYNCHRONOUS_TRACES = 400.0, 115.0
 #: Renders by several processes: time to start them, s; part of the time of one process that kernels take on one
-#: processor; what rows that two look at add. Fitted to `rotating-star` on `davis346`, 0.02 s, 2 and 16 processors, and
-#: 16 with a GPU; judged on `camera-sweep` on `gen2` and `rotating-star` on `eiger`.
-_WORKERS_S, _KERNELS, _NEIGHBOURS = 2.5, 0.8, 1.1
+#: processor, and part of the rest that is not divided, as processes wait for each other; what rows that two look at
+#: add. Fitted to `rotating-star` on `davis346` (2 and 16 processors, and 16 with a GPU, 0.02 and 0.1 s) and on `eiger`
+#: (with a GPU); judged on `camera-sweep` on `gen2` (2 processors).
+_WORKERS_S, _KERNELS, _UNDIVIDED, _NEIGHBOURS = 2.5, 0.8, 0.25, 1.1
 #: Memory of the process that the workers render for, bytes.
 _PARENT_BYTES = 0.4e9
 
@@ -79,7 +80,7 @@ def with_workers(one: Estimate, workers: int) -> Estimate:
     at_once = min(workers, processors())
     # kernels use all processors, or the GPU, anyway; what the host does between them is divided
     kernels = 0.0 if select().backend == "cuda" else min(1.0, _KERNELS / processors())
-    part = _NEIGHBOURS * (kernels + (1 - kernels) / at_once)
+    part = _NEIGHBOURS * (kernels + (1 - kernels) * (_UNDIVIDED + (1 - _UNDIVIDED) / at_once))
     # each holds the pilots of its own pixels
     memory = _PARENT_BYTES + workers * (one.peak_bytes - one.held_bytes) + one.held_bytes
     return replace(one, seconds=one.seconds * part + _WORKERS_S, peak_bytes=memory)

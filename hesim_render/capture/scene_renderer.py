@@ -44,6 +44,7 @@ def scene_renderer(
     window_us = sensor.spec.evs.window_us if sensor.spec.evs is not None else 1.0
     because: str | None = None
     if not exact and samples is None:
+        # workers know the parts of the light by their numbers
         wanted, parts = QUALITY if quality is None else quality, count()
         try:
             return flickering(

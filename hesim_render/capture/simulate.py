@@ -13,7 +13,7 @@ from hesim_render.core import backend
 from hesim_render.core.errors import ConflictError, HesimWarning
 from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress, expect, shown
-from hesim_render.core.workers import require_processes
+from hesim_render.core.workers import checked_processes
 from hesim_render.mosaic.schedule import require_countable
 from hesim_render.recording.recording import Recording, warn_of_exposure
 from hesim_render.recording.writer import RecordingWriter
@@ -99,12 +99,12 @@ def simulate(
         If `out` exists or cannot be written, or, with `resume`, if another run was interrupted there. No partial
         output is left.
     BackendError
-        If a worker ends.
+        If workers cannot be started, or one of them ends.
     """
     scene, sensor = scene_and_sensor(scene, sensor)
     run_settings = RunSettings(**settings)
     duration_us, seed = run_settings.duration_us, run_settings.seed
-    require_processes(workers)
+    workers = checked_processes(workers)
     if workers > 1 and renderer is not None:
         raise ConflictError("workers", workers, "a renderer that is given renders in this process; give no workers")
     if workers > 1 and (run_settings.exact or run_settings.samples is not None):

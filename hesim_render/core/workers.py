@@ -1,5 +1,6 @@
 """Worker processes on this machine that answer calls; each gets its calls in order, and keeps what it has built."""
 
+import operator
 import os
 import queue
 import signal
@@ -30,7 +31,7 @@ class Ticket(NamedTuple):
 
 
 class Workers:
-    """Processes that answer calls. In a with statement they are ended at the end.
+    """Processes that answer calls. They start with the first call; in a with statement they are ended at the end.
 
     Arguments and answers are pickled, and travel through a pipe that no other process has.
 
@@ -46,25 +47,28 @@ class Workers:
     """
 
     def __init__(self, program: str, count: int, threads: int) -> None:
-        self.count, self._calls = count, 0
+        self.count, self._program, self._threads, self._calls = count, with_package(program), str(threads), 0
         self._processes: list[subprocess.Popen[bytes]] = []
         self._pipes: list[Connection] = []
         #: Calls that each worker has not answered, and answers that nobody has asked for.
         self._open: list[deque[int]] = [deque() for _ in range(count)]
         self._answers: dict[int, Any] = {}
+
+    def _start(self) -> None:
+        """Start all processes."""
         # linear algebra in each would take the processors of the others
         environment = {**child_environment(), "OPENBLAS_NUM_THREADS": "1"}
-        for _ in range(count):
+        for _ in range(self.count):
             own, theirs = Pipe()
-            command = python_command(with_package(program), str(theirs.fileno()), str(threads))
-            # in a session of its own, so that an interrupt reaches the run alone, which then ends its workers
-            process = subprocess.Popen(
-                command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                pass_fds=(theirs.fileno(),), start_new_session=True,
-            )  # fmt: skip
-            theirs.close()
-            self._processes.append(process)
             self._pipes.append(own)
+            with theirs:
+                command = python_command(self._program, str(theirs.fileno()), self._threads)
+                # in a session of its own, so that an interrupt reaches the run alone, which then ends its workers
+                process = subprocess.Popen(
+                    command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                    pass_fds=(theirs.fileno(),), start_new_session=True,
+                )  # fmt: skip
+            self._processes.append(process)
 
     def ask(self, worker: int, *call: Any) -> Ticket:
         """Make a call, and do not wait for its answer.
@@ -77,8 +81,14 @@ class Workers:
         Raises
         ------
         BackendError
-            If the worker has ended.
+            If the processes cannot be started, or the worker has ended.
         """
+        if not self._processes:
+            try:
+                self._start()
+            except OSError as error:
+                self.close()
+                raise BackendError(f"{self.count} worker processes cannot be started: {error.strerror}") from None
         try:
             self._pipes[worker].send(call)
         except OSError:
@@ -136,16 +146,21 @@ class Workers:
         self.close()
 
 
-def require_processes(count: int) -> None:
-    """Check a number of processes.
+def checked_processes(count: int) -> int:
+    """A number of processes, also one of NumPy's integers, as an integer of Python.
 
     Raises
     ------
     RangeError
         If it is not whole, or out of range.
     """
-    if not isinstance(count, int) or not 1 <= count <= _MOST:
+    try:
+        result = operator.index(count)
+    except TypeError:
+        result = 0
+    if not 1 <= result <= _MOST:
         raise RangeError("workers", count, f"a whole number of processes, 1 to {_MOST}")
+    return result
 
 
 def serve(answer: Callable[..., Any]) -> None:

@@ -86,10 +86,11 @@ def test_several_processes_divide_what_the_host_does(monkeypatch):
             assert told_of.rays == one.rays
             assert told_of.peak_bytes == (7e8 if workers == 1 else 4e8 + workers * 5e8 + 2e8)
     assert seconds[2, 1] == seconds[16, 1] == 40
-    assert seconds[2, 2] == pytest.approx(2.5 + 40 * 1.1 * (0.4 + 0.6 / 2))
-    assert seconds[16, 5] == pytest.approx(2.5 + 40 * 1.1 * (0.05 + 0.95 / 5))
+    assert seconds[2, 2] == pytest.approx(2.5 + 40 * 1.1 * (0.4 + 0.6 * (0.25 + 0.75 / 2)))
+    assert seconds[16, 5] == pytest.approx(2.5 + 40 * 1.1 * (0.05 + 0.95 * (0.25 + 0.75 / 5)))
     # more processes than processors divide nothing further
-    assert seconds[2, 64] == seconds[2, 2] and seconds[16, 64] == pytest.approx(2.5 + 44 * (0.05 + 0.95 / 16))
+    assert seconds[2, 64] == seconds[2, 2] and seconds[16, 64] < seconds[16, 5]
+    assert seconds[16, 64] == pytest.approx(2.5 + 44 * (0.05 + 0.95 * (0.25 + 0.75 / 16)))
 
 
 class Stopped(Exception):

@@ -10,6 +10,7 @@ import pytest
 import hesim_render as hr
 from hesim_render.core.errors import BackendError, ConflictError, RangeError
 from hesim_render.core.journal import Journal
+from hesim_render.core.workers import Workers
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.part_worker import start
@@ -102,6 +103,18 @@ def test_a_run_goes_on_with_what_its_workers_have_rendered(tmp_path, monkeypatch
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
     # the third run has traced what the second one had not
     assert entries[1] > 0 and entries[2] == entries[0] - entries[1]
+
+
+def test_estimates_are_measured_before_any_process_starts(monkeypatch):
+    """Processes that start take the time of the rays whose speed is measured."""
+
+    def told(expected):
+        assert expected.rays > 0
+        raise InterruptedError
+
+    monkeypatch.setattr(Workers, "_start", None)
+    with pytest.raises(InterruptedError):
+        record("asynchronous", workers=2, on_estimate=told)
 
 
 def test_a_worker_that_dies_ends_the_run_and_leaves_nothing(tmp_path, monkeypatch):

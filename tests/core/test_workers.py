@@ -1,14 +1,16 @@
 """Worker processes answer calls in order, fail with one clear error, and end with the process that started them."""
 
+import errno
 import os
 import signal
+import subprocess
 import time
 
 import numpy as np
 import pytest
 
 from hesim_render.core.errors import BackendError
-from hesim_render.core.workers import Workers
+from hesim_render.core.workers import Workers, checked_processes
 
 #: A worker that remembers numbers, sleeps, fails and gives arrays.
 PROGRAM = """
@@ -85,6 +87,25 @@ def test_a_worker_that_is_killed_is_named():
         with pytest.raises(BackendError, match="signal 9"):
             for _ in range(2):  # the first call may still find the pipe open
                 workers.ask(1, "pid")
+
+
+def test_processes_that_cannot_be_started_leave_none(monkeypatch):
+    started, popen = [], subprocess.Popen
+
+    def limited(*given, **named):
+        if len(started) == 2:
+            raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+        started.append(popen(*given, **named))
+        return started[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", limited)
+    with pytest.raises(BackendError, match="3 worker processes cannot be started: Resource temporarily unavailable"):
+        Workers(PROGRAM, 3, 2).ask(0, "pid")
+    assert [process.poll() for process in started] == [-signal.SIGKILL] * 2
+
+
+def test_numbers_of_processes_may_come_from_numpy():
+    assert type(checked_processes(np.int64(5))) is int
 
 
 def test_workers_end_with_the_run_and_without_it():

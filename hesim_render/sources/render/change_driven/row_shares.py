@@ -50,8 +50,8 @@ class RowShares:
         self._owner = np.arange(sensor.rows) * strips // sensor.rows % workers.count
         self._work = [(0, Counts()) for _ in range(workers.count)]
         self._journal: Journal | None = None
-        for number in range(workers.count):
-            self.ask(number, "make", made)
+        #: What the workers are to make before their first call: estimates of time are measured before they start.
+        self._to_make: dict[str, Any] | None = made
 
     @property
     def rays_done(self) -> int:
@@ -74,6 +74,10 @@ class RowShares:
 
     def ask(self, worker: int, name: str, *given: Any) -> Ticket:
         """See `Workers.ask`."""
+        if self._to_make is not None:
+            made, self._to_make = self._to_make, None
+            for number in range(self._workers.count):
+                self.ask(number, "make", made)
         return self._workers.ask(worker, name, self._part, *given)
 
     def answer(self, ticket: Ticket) -> Any:
