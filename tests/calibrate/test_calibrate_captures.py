@@ -56,7 +56,7 @@ def test_moments_are_those_of_numpy_in_any_order_of_exposures(frames):
             np.testing.assert_allclose(moments.half_means[k, :, side], stack[k][:, mask].mean(axis=1), rtol=1e-12)
 
 
-@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+@pytest.mark.parametrize("save", [np.savez, pytest.param(np.savez_compressed, marks=pytest.mark.slow)])
 def test_frames_are_read_in_bounded_memory(tmp_path, save):
     capture_sets.write_description(tmp_path)
     stack = np.random.default_rng(0).integers(50, 900, (2, 600, 96, 96), dtype=np.uint16)

@@ -73,6 +73,7 @@ def covered(seeds):
     return {name: (sum(hit for hit, _ in values), np.mean([z for _, z in values])) for name, values in found.items()}
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_of_two_sensors():
     """The seeds are fixed."""
     for name, (hits, z) in covered(range(2)).items():
@@ -518,6 +519,7 @@ def test_a_scene_that_moves_at_a_steady_rate_is_a_finding_and_tells_no_leak():
     assert "its rate changes (findings)" in found["recordings"][0]["leak_rate_hz"]["reason"]
 
 
+@pytest.mark.slow
 def test_a_camera_that_has_not_settled_spoils_no_leak():
     """A burst of OFF events at the begin of one of three recordings: the others tell what they told without it."""
     truth, events, moving = sensor(4)

@@ -124,7 +124,7 @@ def test_saturation_is_between_the_levels_around_it(sections):
         assert low < full_well < high and section["full_well_e"]["limited_by"] == "ADC full scale"
 
 
-@pytest.mark.parametrize("limited_by", ("ADC full scale", "full well"))
+@pytest.mark.parametrize("limited_by", [pytest.param("ADC full scale", marks=pytest.mark.slow), "full well"])
 def test_where_the_signal_ends_lies_in_its_interval_wherever_the_levels_are(limited_by):
     """36 of 40 or more; the levels, 670 e⁻ apart, fall anywhere. The standard's value itself is one of the levels."""
     hits = 0

@@ -176,6 +176,7 @@ def test_events_of_some_pixels_are_kept_by_pixel_and_time(monkeypatch):
     assert few.size < 300 and few.max() < events["t_us"][3000]
 
 
+@pytest.mark.slow
 def test_ramps_tell_the_bandwidth_that_late_events_do_not(monkeypatch):
     """Noise of 60 Hz: thresholds to 1 %, and an interval of less than two thirds of that without the ramps."""
     of = Sensor(0.18, 1.1, 0.07, (1 / 18, 1 / 18), 60.0, 0.1, 2.4, 2.0, (0.4, 0.36))
@@ -216,6 +217,7 @@ def test_late_events_of_light_that_comes_to_its_rest_slowly_are_no_noise(monkeyp
     assert overshoot(1.0)[0] > 1.4 * without
 
 
+@pytest.mark.slow
 def test_rests_that_are_short_beside_the_intervals_of_a_ramp_have_their_noise_from_the_ramps(monkeypatch):
     """Six events a ramp and rests of as long as eight of them: no late event is one for sure. Without a correction
     thresholds are 3 % too low, many of their errors.

@@ -116,6 +116,7 @@ def judged(of, tallies):
     return np.array(outcome)  # [recording, figure, hit and error]
 
 
+@pytest.mark.slow
 def test_pixels_that_see_less_of_the_target_and_parts_of_cycles_do_not_count():
     """Of 26 rows three see 0.6 of the contrast, as at the corners of a checkerboard, and three rise and fall longer, as
     in the middle of a star; 9.45 cycles begin at any place, but those of the left half alike.
@@ -580,7 +581,8 @@ def test_both_overshoots_scatter_together_by_their_bandwidth_and_by_the_ramps(mo
     assert expected > 0.2 and alike == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", ["low thresholds", pytest.param("slow, no leak", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["low thresholds", "slow, no leak"])
 def test_noise_at_the_rests_does_not_lower_the_thresholds(name):
     """Three recordings. Without the overshoots they are 2.3 and 3.9 % too low, four to twenty of their errors."""
     outcome = judged(SIX[name], recordings(SIX[name], 1, 3))

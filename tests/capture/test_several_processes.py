@@ -74,6 +74,7 @@ def test_what_rests_and_how_many_rays_were_traced_is_known_here():
         assert told == sorted(told) and len(told) >= 4 and told[-1] == two.rays_traced > one.rays_traced
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_what_its_workers_have_rendered(tmp_path, monkeypatch):
     out, entries, answers = tmp_path / "out", [0, 0, 0], 0
     keep, answer = Journal.keep, RowShares.answer

@@ -390,7 +390,11 @@ main(sys.argv[2:])
 
 @pytest.mark.parametrize(
     ("number", "when", "left"),
-    [(signal.SIGINT, "before", []), (signal.SIGTERM, "before", []), (signal.SIGINT, "after", [".o.unfinished"])],
+    [
+        (signal.SIGINT, "before", []),
+        pytest.param(signal.SIGTERM, "before", [], marks=pytest.mark.slow),
+        (signal.SIGINT, "after", [".o.unfinished"]),
+    ],
 )
 def test_interrupt_exits_130_and_leaves_what_was_kept_or_nothing(number, when, left, tmp_path):
     child = subprocess.Popen(
@@ -438,6 +442,7 @@ def test_the_main_job_end_to_end(capsys, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_lab_calibrate_and_simulate_end_to_end(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     status, out, err = call(

@@ -88,7 +88,7 @@ def test_an_interrupt_at_any_rename_leaves_the_old_or_the_new(tmp_path, monkeypa
     assert [path.name for path in tmp_path.iterdir()] == ["r"]
 
 
-@pytest.mark.parametrize("can", ["yes", "no"])
+@pytest.mark.parametrize("can", ["yes", pytest.param("no", marks=pytest.mark.slow)])
 def test_killed_at_any_step_of_a_commit(tmp_path, can):
     """The next run puts right what is left; before it the old folder or the new one is there, unless neither could
     be in one step."""

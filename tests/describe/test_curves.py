@@ -373,7 +373,7 @@ def test_noise_and_latency_have_no_kink_where_the_dark_current_begins(name):
     assert np.count_nonzero(np.diff(np.sign(np.diff(rate_hz)[np.abs(np.diff(rate_hz)) > 1e-9]))) == 1
 
 
-@pytest.mark.parametrize("name", ["imx636", "eiger", "reference-bayer"])
+@pytest.mark.parametrize("name", [pytest.param("imx636", marks=pytest.mark.slow), "eiger", "reference-bayer"])
 def test_texts_on_the_axes_of_the_picture_do_not_overlap(name, tmp_path, monkeypatch):
     """And the point of the data sheet, which counts all events, lies on a curve that counts all events."""
     drawn = []

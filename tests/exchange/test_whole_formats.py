@@ -177,7 +177,7 @@ def test_the_npz_of_h_esim_hold_every_event_of_each_tick(tmp_path):
     np.testing.assert_array_equal(again.frames[1].raw, recording.frames[1].raw)
 
 
-@pytest.mark.parametrize("name", ["eiger", "davis346"])
+@pytest.mark.parametrize("name", [pytest.param("eiger", marks=pytest.mark.slow), "davis346"])
 def test_videos_are_read_by_opencv(name, tmp_path):
     recording = recordings.make(name, tmp_path / "r")
     for kind in ("mp4", "mp4-colour", "mp4-events"):

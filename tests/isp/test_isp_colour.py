@@ -14,7 +14,7 @@ ROWS, COLS = 192, 288
 
 
 @pytest.mark.filterwarnings("ignore:Aligning")
-@pytest.mark.parametrize("light", ["D65", "A"])
+@pytest.mark.parametrize("light", [pytest.param("D65", marks=pytest.mark.slow), "A"])
 def test_rendered_chart_comes_out_within_two_delta_e(light):
     sensor = hr.load_sensor("reference-bayer").crop(COLS, ROWS)
     scene = hr.load_scene("colorchecker", {"light.illuminant": light})

@@ -159,6 +159,7 @@ def test_a_calibrated_sensors_maps_come_from_its_calibration(calibration, tmp_pa
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.slow
 def test_charts_are_measured_without_noise_reduction(tmp_path):
     """Balance and matrix of a noisy chart are the same whether or not its noise is reduced."""
     picture = images()["checker"]
@@ -277,7 +278,8 @@ BEST = {
 }
 
 
-@pytest.mark.parametrize("lux", [20, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("lux", [20, 100])
 def test_noise_reduction_beats_hand_set_filters(lux):
     data = pytest.importorskip("skimage.data")
     against_clean, against_true = gained(data.astronaut()[40:296, 100:356], lux, BEST)

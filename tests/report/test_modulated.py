@@ -72,6 +72,7 @@ def test_bursts_show_the_bandwidth_of_pixels_with_a_long_dead_time(tmp_path):
     assert found.entry["standard_error"] < 0.04 * corner_hz
 
 
+@pytest.mark.slow
 def test_continuous_modulation_does_not_and_says_so(tmp_path):
     found = figures.event_figures(band_bench(tmp_path / "always", False, 12))
     entry = next(one for one in found.entries if one.key == "bandwidth")
@@ -95,7 +96,7 @@ def slow_bench(folder, own, rng, *, swings=(1.6, 3.2), hz=7.0, dead_us=0.0, **co
     return written(folder, modulation, files, **content)
 
 
-@pytest.mark.parametrize("dead_us", [0.0, 200.0])
+@pytest.mark.parametrize("dead_us", [pytest.param(0.0, marks=pytest.mark.slow), 200.0])
 def test_thresholds_by_counts_need_no_reset(tmp_path, dead_us):
     """Both thresholds, in spite of a background of 6 Hz and of a dead time that swallows up to 8 % of the events."""
     rng = np.random.default_rng(21)

@@ -287,6 +287,7 @@ def test_what_more_units_would_not_show(shares, times, expected):
     assert audit_module.is_hopeless(shares, times) is expected
 
 
+@pytest.mark.slow
 def test_an_audit_gives_up_where_its_rays_would_not_do(monkeypatch):
     """Few events, all of them right: that none is missed takes more units than it may look at. It looks at calm units
     for an eighth of its rays, and leaves most of the others.
@@ -736,6 +737,7 @@ class Halves(Given):
             yield Sample(sample.half_a + apart, sample.half_b - apart, sample.error)
 
 
+@pytest.mark.slow
 def test_values_that_are_off_by_their_own_stated_error_have_no_quality_that_would_do():
     truth = np.full((TICKS, ROWS * COLS), 1.3e5)
     run = truth * (1 + 2.7 * UNIT * np.random.default_rng(2).normal(size=truth.shape))

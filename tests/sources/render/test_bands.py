@@ -80,6 +80,7 @@ def test_events_are_the_same_in_small_bands(small_bands):
     assert np.any(np.ptp(whole, axis=0) > 0)
 
 
+@pytest.mark.slow
 def test_memory_of_a_block_is_that_of_a_band(small_bands):
     """Tables of 65 windows of 64 × 48 pixels take 0.8 MB each, of which a block without bands holds two dozen."""
     sensor, peaks = hr.load_sensor("davis346", {"evs.threshold_mismatch_rel": 0.02}).crop(64, 48, 141, 107), []

@@ -121,6 +121,7 @@ def values_of(seconds, cols, rows, tuning=TUNING):
     return source, wins, np.array(flux, np.float64)
 
 
+@pytest.mark.slow
 def test_no_value_depends_on_the_end_of_the_run_and_a_third_of_the_rays_is_saved():
     source, _, flux = values_of(0.012, 7, 5)
     _, _, short = values_of(0.007, 7, 5)

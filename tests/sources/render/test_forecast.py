@@ -17,7 +17,8 @@ from hesim_render.sources.renderer import Demand
 
 
 @pytest.mark.parametrize(("scene", "sensor", "region", "duration_us"), [
-    ("camera-sweep", "gen2", (1400, 1100, 900, 700), 20_000), ("camera-sweep", "davis346", (160, 120, 90, 60), 1500),
+    pytest.param("camera-sweep", "gen2", (1400, 1100, 900, 700), 20_000, marks=pytest.mark.slow),
+    ("camera-sweep", "davis346", (160, 120, 90, 60), 1500),
     pytest.param("pendulum", "davis346", (200, 150, 70, 50), 1500, marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_samples_of_pixels_have_the_rays_of_all(scene, sensor, region, duration_us):
@@ -103,6 +104,7 @@ motion:
 """
 
 
+@pytest.mark.slow
 def test_what_never_changes_is_counted_once(tmp_path):
     """Pixels that nothing moving comes near were counted in each of the blocks of a run: 1.4 times the rays here."""
     (tmp_path / "plate.yaml").write_text(PLATE)

@@ -39,7 +39,9 @@ def test_pixels_that_lie_apart_are_taken_one_by_one(monkeypatch):
     assert forecast._sample(pixel, source, "any", rng).tolist() == [8 * k for k in (0, 300, 450, 775, 825)]
 
 
-@pytest.mark.parametrize(("sensor", "is_short"), [("davis346", True), ("reference-mono", False)])
+@pytest.mark.parametrize(
+    ("sensor", "is_short"), [pytest.param("davis346", True, marks=pytest.mark.slow), ("reference-mono", False)]
+)
 def test_only_asynchronous_pixels_that_see_paths_have_short_audits(sensor, is_short):
     scene = hr.load_scene(Path(__file__).parents[3] / "benchmarks/scenes/floor-ball.yaml")
     sensor = hr.load_sensor(sensor).crop(8, 6, 30, 20)

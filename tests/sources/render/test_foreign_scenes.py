@@ -178,7 +178,9 @@ def test_a_pixel_in_which_no_ray_saw_light_states_the_error_that_is_wanted():
     assert rays[1] - rays[0] > 56 * 0.5 * dark.sum() and TUNING.dark_rays == 64
 
 
-@pytest.mark.parametrize("name", ["room", "floor-ball", "copper", "glass-ball"])
+@pytest.mark.parametrize(
+    "name", ["room", "floor-ball", *(pytest.param(name, marks=pytest.mark.slow) for name in ("copper", "glass-ball"))]
+)
 def test_the_scenes_of_the_benchmark_take_the_default_mode_and_move(name):
     sensor = hr.load_sensor("davis346").crop(24, 18, 140, 100)
     source = ChangeDrivenFlux(hr.load_scene(BENCHMARK / f"{name}.yaml"), sensor, seed=3)

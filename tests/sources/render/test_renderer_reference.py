@@ -81,6 +81,7 @@ def test_edge_that_moves_across_pixels(move):
     assert 0.4 < np.mean(z**2) < 1.15 + 4.4 * np.sqrt(3.6 / len(windows))
 
 
+@pytest.mark.slow
 def test_lamp_that_flickers_while_it_moves():
     """The light's power and the coverage change together; the mean of their product in NumPy."""
     waveforms = {
@@ -107,6 +108,7 @@ def test_lamp_that_flickers_while_it_moves():
         assert np.all(found.stderr < 1e-2 * unit)
 
 
+@pytest.mark.slow
 def test_diffuse_plate_under_an_area_light():
     """E is given on the plane; L = ρ E/π there."""
     light = {

@@ -149,7 +149,7 @@ def test_in_a_furnace_all_light_is_there(scene_of):
     assert shared.std(axis=0).mean() < 0.8 * alone.std(axis=0).mean()
 
 
-@pytest.mark.parametrize("with_things", [False, True])
+@pytest.mark.parametrize("with_things", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_shared_light_has_no_bias(scene_of, with_things):
     """Against the same number of paths that share nothing, while a box moves by two pixels within the window."""
     source = source_of(scene_of(WALLS + (THINGS if with_things else ""), motion=MOTION if with_things else ""))
@@ -344,6 +344,7 @@ def test_shadow_rays_of_lamps_and_paths_that_end_count_for_a_tile(scene_of):
     assert tracer.shared(pixel, 0 * pixel.astype(np.int64), windows, np.full(pixel.size, 8), lattice).met.all()
 
 
+@pytest.mark.slow
 def test_runs_have_the_same_values_for_crops_and_splits(scene_of):
     """Over an anchor at 64 ms, of the whole region and of a part of it that cuts tiles."""
     camera = "camera: {focal_length_mm: 6.1}\n"
@@ -581,6 +582,7 @@ def test_what_a_linked_pair_becomes():
     assert given == []
 
 
+@pytest.mark.slow
 def test_linked_pairs_have_no_bias_and_the_noise_of_their_differences(scene_of):
     """A whole run with few rays of pairs by themselves, for five seeds, against paths that share nothing."""
     few = replace(TUNING, most_rays=512, least_shared_rays=32, least_sharing_gain=0.1, difference_gain=1e9)

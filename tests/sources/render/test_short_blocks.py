@@ -45,7 +45,7 @@ def run(scene, begin_us, end_us):
 @pytest.mark.parametrize(
     ("light", "thing", "part"),
     [
-        pytest.param(SUN, {}, 0.96, id="direct"),
+        pytest.param(SUN, {}, 0.96, id="direct", marks=pytest.mark.slow),
         # nearly every pixel has a path that may meet the ball
         pytest.param(SUN, PLASTIC, 1.01, id="paths", marks=pytest.mark.slow),
         # what outlines hide of the sky changes where no ray meets them too

@@ -346,6 +346,7 @@ def test_the_same_seed_gives_the_same_recording():
     assert once.events.size > 100
 
 
+@pytest.mark.slow
 def test_memory_stays_the_same_however_long_the_video():
     """20 000 pictures mapped on one: at most three flux maps are kept, and one more for each picture in a window."""
     one = np.full((1, 32, 32), 200, np.uint8)
