@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hesim_render.sources.render.change_driven.aim import PairAims
 from hesim_render.sources.render.change_driven.bends import straightened
+from hesim_render.sources.render.change_driven.change_detector import seen_with_few_or_all
 from hesim_render.sources.render.change_driven.deep_shadow import deep_shadow
 from hesim_render.sources.render.change_driven.edge_courses import Courses, courses
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
@@ -109,11 +110,12 @@ class AdaptiveRenderer:
         at_once = pixels_at_once(role, self.has_ticks, apart)
         for place in squares(*np.divmod(index, self._sensor.spec.geometry.cols), at_once):
             # a single window is not followed through time, and needs no pixels beside those that lie apart
+            few_first = role == "any" and self.tracer.is_diffuse and not (lattice is None or apart)
             if lattice is None or (apart and role == "any"):
                 sites = Sites.alone(index[place])
             else:
-                sites = Sites.around(index[place], lattice)
-            yield Band(place, sites, self.noise.of(role, sites.index), apart, rays, quality, mild)
+                sites = Sites.around(index[place], lattice, int(few_first))
+            yield Band(place, sites, self.noise.of(role, sites.index), apart, rays, quality, mild, few_first)
 
     def pilot(
         self,
@@ -136,6 +138,8 @@ class AdaptiveRenderer:
         def wanted(flux: NDArray[np.float32]) -> NDArray[np.float32]:
             return np.float32(band.quality) * band.unit(flux)
 
+        if band.few_first:
+            known = seen_with_few_or_all(*of[:2], numbers[0], windows, *of[4:], span_us, wanted)
         # few rays look at blocks of ticks only; the bound of motion takes rays of its own where the camera moves
         steps, few = len(numbers) - 1, 1
         if self.has_ticks and steps > 1:

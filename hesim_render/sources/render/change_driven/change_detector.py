@@ -1,4 +1,4 @@
-"""Few rays tell in which windows a pixel shows anything new.
+"""Few rays tell which pixels are even, and in which windows these show anything new.
 
 A sensor with a tick has to be looked at in each window, since things move by pixels from one tick to the next, but most
 pixels show the same in all windows of a block. A part of the pilot's rays is enough to see that in an *even* pixel,
@@ -66,6 +66,39 @@ def _turns(sites: Sites, place: NDArray[np.int64], count: int, stride: int) -> I
     # what comes between the last look of few rays and that of all would go unseen
     turn[[0, count - 2]], turn[-1] = True, False
     yield turn
+
+
+def seen_with_few_or_all(
+    tracer: PairTracer,
+    sites: Sites,
+    window: NDArray[np.integer],
+    windows: Windows,
+    rays: int,
+    width_px: float,
+    span_us: tuple[float, float] | None,
+    wanted: Wanted,
+) -> PilotFlux:
+    """What sites with neighbours show in one window each: few rays see that of even sites, all rays that of the others
+    and of those beside them, whose few rays may have missed what is there.
+
+    Parameters
+    ----------
+    sites, window, windows : the sites, their windows [site], and all windows. Of the outermost ones it is not known
+        whether sites beside them are even, so that nothing may follow from what these show.
+    rays, width_px, span_us : of the pilot, see `PairTracer.pilot`.
+    wanted : wanted error of each site.
+    """
+    few = tracer.pilot(sites.index, window, windows, DETECTOR_RAYS, width_px, span_us=span_us)
+    flux, scatter = better_estimate(few)
+    asks = sites.near(scatter > _EVEN * wanted(flux), 1)
+    if span_us is not None:
+        # what nothing comes near keeps its flux for the whole run
+        asks |= ~sites.near(few.met, 1)
+    some = np.flatnonzero(asks)
+    if some.size:
+        seen = tracer.pilot(sites.index[some], window[some], windows, rays, width_px, span_us=span_us)
+        few = few.with_pairs(some, seen)
+    return few
 
 
 def windows_with_changes(

@@ -97,6 +97,7 @@ class Band:
     pilot_rays : pilot rays per pixel and window.
     quality : wanted error in noise units.
     mild : take the mild scatter of the pilot's rays, see `PilotFlux`.
+    few_first : few rays say at which sites the pilot takes all of its rays, see `seen_with_few_or_all`.
     """
 
     place: NDArray[np.int64]
@@ -106,6 +107,7 @@ class Band:
     pilot_rays: int
     quality: float
     mild: bool
+    few_first: bool = False
 
     @property
     def index(self) -> NDArray[np.uint32]:

@@ -134,10 +134,12 @@ class Sites:
         return cls(index, listed.astype(np.int64))
 
     @classmethod
-    def around(cls, pixel: NDArray[np.uint32], lattice: Lattice) -> "Sites":
-        """Listed pixels with their neighbours up to `REACH` away, or, where they lie apart, with the next ones."""
+    def around(cls, pixel: NDArray[np.uint32], lattice: Lattice, more: int = 0) -> "Sites":
+        """Listed pixels with their neighbours up to `REACH` away and some `more`, or, where they lie apart, with the
+        next ones.
+        """
         apart = lattice.step != (1, 1)
-        reach = 1 if apart else REACH
+        reach = (1 if apart else REACH) + more
         # the smallest rectangle [row, col] with all listed pixels and their neighbours, cut to the sensor
         row, col = lattice.place(pixel)
         top, bottom = max(0, int(row.min()) - reach), min(lattice.rows, int(row.max()) + reach + 1)
