@@ -176,7 +176,7 @@ def test_rays_of_frames_have_less_beside_them():
     ("scene", "sensor", "duration_s"), [("fan", "dvxplorer", 0.001), ("camera-sweep", "gen2", 0.005)]
 )
 def test_the_memory_of_a_run_is_the_estimated_one(scene, sensor, duration_s):
-    # the largest memory by `getrusage` is at least that of the process that starts this one, here with many tests behind
+    # the largest memory by `getrusage` is at least that of the process that starts this one, which has run many tests
     code = f"""
 import resource
 import sys

@@ -37,8 +37,8 @@ class Tuning:
     path_pilot_rays : rays, F. As `pilot_rays`, of asynchronous pixels that see paths; chosen on `room` and `floor-ball`
         of `benchmarks/scenes`, judged on `sky-knot` there. Without (as few as `pilot_rays`): so few of the rays show
         changes of bounced light that windows between rendered ones are further off.
-    frame_pilot_rays : rays, H. Pilot rays of a frame pixel in an exposure; of an even one, few rays do. Without: objects
-        that pass in a small part of the exposure are missed.
+    frame_pilot_rays : rays, H. Pilot rays of a frame pixel in an exposure; of an even one, few rays do. Without:
+        objects that pass in a small part of the exposure are missed.
     look_stride : windows, C. The pilot of an asynchronous sensor looks at every so many windows; where two looks
         differ, it looks again half way between, and so on. Within this time, nothing moves by more than 0.8 pixels, so
         that nothing crosses the pixels around between two looks. Without (1): most of a pilot's rays see what the last
