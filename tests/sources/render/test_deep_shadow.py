@@ -153,6 +153,7 @@ def test_pixels_that_lie_apart_are_looked_at_in_a_block(monkeypatch, apart, wind
         pilot_rays=32,
         quality=0.6,
         mild=True,
+        few_first=False,
         unit=lambda flux: flux / np.float32(10),
     )
     times, numbers = Windows(np.arange(windows) * 4.0, np.arange(windows) * 4.0 + 3), np.zeros((windows, 5), int)
