@@ -519,7 +519,6 @@ def test_a_scene_that_moves_at_a_steady_rate_is_a_finding_and_tells_no_leak():
     assert "its rate changes (findings)" in found["recordings"][0]["leak_rate_hz"]["reason"]
 
 
-@pytest.mark.slow
 def test_a_camera_that_has_not_settled_spoils_no_leak():
     """A burst of OFF events at the begin of one of three recordings: the others tell what they told without it."""
     truth, events, moving = sensor(4)

@@ -116,7 +116,6 @@ def judged(of, tallies):
     return np.array(outcome)  # [recording, figure, hit and error]
 
 
-@pytest.mark.slow
 def test_pixels_that_see_less_of_the_target_and_parts_of_cycles_do_not_count():
     """Of 26 rows three see 0.6 of the contrast, as at the corners of a checkerboard, and three rise and fall longer, as
     in the middle of a star; 9.45 cycles begin at any place, but those of the left half alike.

@@ -505,7 +505,6 @@ def test_single_pixels_keep_their_fixed_pattern(session, tmp_path):
     assert np.corrcoef(means[0], means[1])[0, 1] > 0.98  # rows of 1.5 DN, pixels of 0.3 DN, noise of 0.15 DN
 
 
-@pytest.mark.slow
 def test_event_counts_simulated_with_the_calibration_are_those_captured(session, tmp_path):
     """Counts of every position and polarity, in the dark and in three ranges of light: 32 scores, |z| < 4.5: 2e-4."""
     folder, sensor, _ = session

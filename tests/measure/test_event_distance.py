@@ -58,7 +58,6 @@ def poisson(seed, rate=1.0, on=0.6, hot=0, rhythm=0.0, burst=1, pairs=0.0, regul
     return event_statistics(EventStream.of(made(np.ceil(t_us).astype(int), pixel, polarity), SHAPE))
 
 
-@pytest.mark.slow
 def test_equal_laws_do_not_differ():
     """Seven figures, eight pairs: at 5 % each three differ on average; 10 or more have a chance of 1e-3."""
     found = [event_distances(poisson(2 * k), poisson(2 * k + 1)) for k in range(8)]

@@ -331,7 +331,6 @@ def test_labels_neither_drift_nor_need_more_memory_as_time_goes_on(dead_us):
     assert np.ptp(shares[1:]) < 0.01
 
 
-@pytest.mark.slow
 def test_what_is_let_go_of_changes_no_label(monkeypatch):
     noise = model(True, evs__threshold_mismatch_rel=0.1, evs__refractory_period_us=300)
     found = []

@@ -149,7 +149,6 @@ def hopkins(nu, defocus):
     return 2 * np.trapezoid(height * np.cos(8 * np.pi * defocus * nu * x), x) / np.pi
 
 
-@pytest.mark.slow
 def test_the_product_of_diffraction_and_defocus_is_off_where_the_documentation_says():
     """docs/physics.md: by more than 0.01 from 0.04 to 33 wavelengths of defocus, by at most 0.25."""
     nu = np.concatenate([np.linspace(1e-3, 0.1, 400), np.linspace(0.1, 0.999, 200)])

@@ -81,7 +81,6 @@ def test_edge_that_moves_across_pixels(move):
     assert 0.4 < np.mean(z**2) < 1.15 + 4.4 * np.sqrt(3.6 / len(windows))
 
 
-@pytest.mark.slow
 def test_lamp_that_flickers_while_it_moves():
     """The light's power and the coverage change together; the mean of their product in NumPy."""
     waveforms = {

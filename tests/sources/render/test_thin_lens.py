@@ -176,7 +176,6 @@ def test_events_of_the_default_mode_have_the_error_that_they_state():
     assert abs(by_pixel.mean()) < 4.4 * by_pixel.std() / np.sqrt(by_pixel.size)
 
 
-@pytest.mark.slow
 def test_what_moves_far_out_of_focus_changes_every_pixel_of_its_blur():
     """A spark of a hundredth of the blur circle, which few rays of a pixel meet, crosses the picture."""
     ends = [{"t_us": 0}, {"t_us": 10_000, "translation_m": [0.02, 0, 0]}]

@@ -78,14 +78,14 @@ def seen_with_few_or_all(
     span_us: tuple[float, float] | None,
     wanted: Wanted,
 ) -> PilotFlux:
-    """What sites with neighbours show in one window each: few rays see that of even sites, all rays that of the others
-    and of those beside them, whose few rays may have missed what is there.
+    """What sites with neighbours show in one window each: few rays see that of even sites, all rays that of the others,
+    of those beside them, whose few rays may have missed what is there, and of those that seem to be constant.
 
     Parameters
     ----------
     sites, window, windows : the sites, their windows [site], and all windows. Of the outermost ones it is not known
         whether sites beside them are even, so that nothing may follow from what these show.
-    rays, width_px, span_us : of the pilot, see `PairTracer.pilot`.
+    rays, width_px, span_us : of the pilot, see `PairTracer.pilot`; without `span_us` no site is constant.
     wanted : wanted error of each site.
     """
     few = tracer.pilot(sites.index, window, windows, DETECTOR_RAYS, width_px, span_us=span_us)
