@@ -147,6 +147,11 @@ class PacketTracer(Tracer):
         return isinstance(self._integrator, DiffuseIntegrator)
 
     @property
+    def is_plain(self) -> bool:
+        """True if all visible light is direct light on diffuse surfaces without pictures."""
+        return isinstance(self._integrator, DiffuseIntegrator) and not self._integrator.has_pictures
+
+    @property
     def moves_outlines(self) -> bool:
         """True if the same rays, which meet nothing that moves, may bring another flux at another time."""
         return isinstance(self._integrator, DiffuseIntegrator) and self._integrator.moves_outlines

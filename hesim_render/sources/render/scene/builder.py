@@ -28,7 +28,16 @@ from hesim_render.sources.render.scene.mitsuba_version import (
 from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.sources.render.scene.pictures import picture_texture
 from hesim_render.sources.render.scene.scene_spectra import check_coverage, target_pieces
-from hesim_render.sources.render.scene.surfaces import Paint, area_emitter, bsdf_of, is_diffuse, paint_of, radiance_of
+from hesim_render.sources.render.scene.surfaces import (
+    Paint,
+    are_few,
+    area_emitter,
+    bsdf_of,
+    is_diffuse,
+    paint_of,
+    pictured,
+    radiance_of,
+)
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals
 from hesim_render.specs.geometry import rotation_about
@@ -146,6 +155,9 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
         with as_spec_error(spec.file):
             scene = mi.load_dict({"type": "scene", **content}, optimize=False)
         integrator = path_tracer(mi, spec.depth)
+        filters = 1 if responses is None else len(responses)
+        if paints is not None and not are_few(paints, len(spec.lights) * filters):
+            paints = None
     parameters = mi.traverse(scene)
     if spec.mitsuba is None:
         without = {name for item in spec.objects for name in _without_normals(item, spec, groups)}
@@ -199,8 +211,10 @@ def _describe(
             name = f"target_{number}"
             content[name] = _piece(mi, name, piece)
             groups["target"].append(name)
-            if isinstance(piece.reflectance, Picture) or piece.radiance is not None:
+            if piece.radiance is not None:
                 all_diffuse = False
+            elif isinstance(piece.reflectance, Picture):
+                paints.append(pictured(name, piece.reflectance))
             else:
                 paints.append(Paint(name, (piece.reflectance,)))
     for number, item in enumerate(spec.objects):

@@ -1,6 +1,6 @@
 """Surfaces of a scene file's objects: paint, pictures, and materials of Mitsuba."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,34 +16,42 @@ from hesim_render.sources.render.scene.sizes import require_fits
 from hesim_render.specs.reflectance import TextureSpec
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.spectral.spectrum import Spectrum
+from hesim_render.spectral.spectrum import Spectrum, constant
 from hesim_render.targets.cube import read_picture
+from hesim_render.targets.piece import Picture
 
+#: Most numbers of all pictures of a scene whose texels are integrated for each light and filter, 256 MiB of them.
+_MOST_ENTRIES = 1 << 26
 #: Shapes without an inside; both of their sides are visible.
 _OPEN_SHAPES = ("rectangle", "mesh")
 
 
 @dataclass(frozen=True)
 class Paint:
-    """Paint of a shape: one diffuse colour, or a checkerboard of two.
+    """Paint of a shape: one diffuse colour, a checkerboard of two, or a picture.
 
     Parameters
     ----------
     shape : id of the shape in the Mitsuba scene.
-    colours : one or two reflectances.
-    scale : factors on (u, v) of the shape; the squares of the checkerboard then have a side of one half.
+    colours : one or two reflectances; 1 with a picture.
+    scale : factors on (u, v) of the shape; the squares of the checkerboard then have a side of one half, the picture
+        one of 1.
     two_sided : True if the back is painted as well; otherwise the back is black.
+    picture : reflectances by place; None for none.
+    repeats : True if the picture is seen again beyond 0 to 1, False if its rim is.
     """
 
     shape: str
     colours: tuple[Spectrum, ...]
     scale: tuple[float, float] = (1.0, 1.0)
     two_sided: bool = False
+    picture: Picture | None = None
+    repeats: bool = False
 
 
 def is_diffuse(item: ObjectSpec) -> bool:
-    """True if an object is diffuse, of one or two colours, and does not shine."""
-    return item.material is None and item.texture is None and item.emission is None and item.materials == "own"
+    """True if an object is diffuse, of one or two colours or with a picture, and does not shine."""
+    return item.material is None and item.emission is None and item.materials == "own"
 
 
 def reflects_diffusely(mi: MitsubaModule, bsdf: MitsubaObject | None) -> bool:
@@ -55,11 +63,30 @@ def reflects_diffusely(mi: MitsubaModule, bsdf: MitsubaObject | None) -> bool:
     return flags is not None and not any(mi.has_flag(flags, other) for other in others)
 
 
+def pictured(shape: str, picture: Picture, repeat: tuple[int, int] | None = None, two_sided: bool = False) -> Paint:
+    """The paint of a shape whose picture is seen `repeat` times along u and v; None: once, and its rim beyond."""
+    across, up = repeat or (1, 1)
+    white = constant(1.0)
+    return Paint(shape, (white,), (float(across), float(up)), two_sided, picture, repeat is not None)
+
+
 def paint_of(item: ObjectSpec, name: str) -> Paint:
     """The paint of a diffuse object's shape."""
+    if item.texture is not None:
+        picture = read_picture(item.texture, f"objects.{item.name}.texture")
+        return pictured(name, picture, item.texture.repeat, item.shape in _OPEN_SHAPES)
     colours = [source.load() for source in (item.reflectance, item.pattern) if source is not None]
     u, v = item.pattern_count
     return Paint(name, tuple(colours), (u / 2, v / 2), two_sided=item.shape in _OPEN_SHAPES)
+
+
+def are_few(paints: Sequence[Paint], colours: int) -> bool:
+    """True if the texels of all pictures fit into memory with `colours` numbers each, one for each light and filter; a
+    grey texel has one.
+    """
+    pictures = [paint.picture for paint in paints if paint.picture is not None]
+    sizes = [picture.values[..., 0].size * (1 if picture.kind == "grey" else colours) for picture in pictures]
+    return sum(sizes) <= _MOST_ENTRIES
 
 
 def radiance_of(item: ObjectSpec) -> Spectrum | None:

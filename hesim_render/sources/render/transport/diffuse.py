@@ -44,11 +44,13 @@ from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.occluded_lamps import SLOTS, LampShadows
 from hesim_render.sources.render.transport.outlines import OccludedSky
 from hesim_render.sources.render.transport.swept_boxes import Moment
+from hesim_render.sources.render.transport.texels import Texels
 from hesim_render.specs.light import LightSpec, irradiance
 from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product, summed
+from hesim_render.targets.piece import Picture
 
 #: Columns of a shape's row in the table of paints: number of its one or two colours, whether both sides are painted,
-#: number of its lamp from 1, and the scale of its checks.
+#: number of its lamp from 1, the scale of its checks or picture, and the number of its picture from 1.
 _ROW = 8
 
 
@@ -102,14 +104,21 @@ class DiffuseIntegrator:
         black = constant(0.0)
         colours: list[Spectrum] = [black]
         rows: dict[str, list[float]] = {}
+        pictures: list[tuple[Picture, bool]] = []
         for paint in paints:
             numbers = [len(colours) + k for k in range(len(paint.colours))]
             colours += paint.colours
-            rows[paint.shape] = [numbers[0], numbers[-1], float(paint.two_sided), 0.0, *paint.scale, 0.0, 0.0]
+            number_of_picture = 0.0
+            if paint.picture is not None:
+                pictures.append((paint.picture, paint.repeats))
+                number_of_picture = float(len(pictures))
+            both = float(paint.two_sided)
+            rows[paint.shape] = [numbers[0], numbers[-1], both, 0.0, *paint.scale, number_of_picture, 0.0]
         for name, number in lamp_of.items():
             rows[name] = [0.0, 0.0, 0.0, number + 1.0, 1.0, 1.0, 0.0, 0.0]
         self._has_checks = any(len(paint.colours) > 1 for paint in paints)
         self._tables(rows, colours, irradiances, strengths, list(responses.values()))
+        self._texels = Texels(scene.mi, pictures, irradiances, list(responses.values())) if pictures else None
         dr.make_opaque(self._rows, self._reflected, self._emitted, self._filters, self._colours)
 
     def _tables(
@@ -176,12 +185,15 @@ class DiffuseIntegrator:
         first = 2 * dr.select(hit, which, 0)
         one, other, both, lamp = dr.gather(mi.Vector4f, self._rows, first)
         front = mi.Frame3f.cos_theta(si.wi) > 0
-        colour = one
-        if self._has_checks:
-            u, v, _, _ = dr.gather(mi.Vector4f, self._rows, first + 1)
+        colour, texel = one, None
+        if self._has_checks or self._texels is not None:
+            u, v, picture, _ = dr.gather(mi.Vector4f, self._rows, first + 1)
             place = mi.Point2f(si.uv.x * u, si.uv.y * v)
             beyond = (place - dr.floor(place)) > 0.5
             colour = dr.select(beyond.x == beyond.y, one, other)
+            if self._texels is not None:
+                has_picture = hit & (picture > 0)
+                texel = self._texels.at(mi.UInt32(dr.maximum(picture - 1, 0)), place, has_picture)
 
         # light sources that the ray hits
         emits = dr.select(hit, (lamp > 0) & front, self._has_sky)
@@ -205,6 +217,10 @@ class DiffuseIntegrator:
                 (number * self._filters + filter_index) * self._colours + mi.UInt32(colour),
                 asks,
             )
+            if self._texels is not None and texel is not None:
+                seen_texel = asks & has_picture
+                of_texel = self._texels.factor(texel, number * self._filters + filter_index, scale, seen_texel)
+                scale = dr.select(seen_texel, of_texel, scale)
             known = open_
             if shadows is not None and self._shadows is not None and isinstance(light, _Lamp):
                 of = normal, shadow, moment, dr.select(asks, shadows, 0)
@@ -226,6 +242,11 @@ class DiffuseIntegrator:
     def moves_outlines(self) -> bool:
         """True if outlines before the sky move: the known share of the sky changes where no ray meets anything too."""
         return self._outlines is not None and bool(self._outlines.groups)
+
+    @property
+    def has_pictures(self) -> bool:
+        """True if a surface has a picture."""
+        return self._texels is not None
 
     @property
     def knows_shadows(self) -> bool:
