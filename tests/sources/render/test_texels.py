@@ -17,6 +17,7 @@ from hesim_render.sources.render.exact import used_responses
 from hesim_render.sources.render.scene import surfaces
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.scene.pictures import picture_texture
+from hesim_render.sources.render.transport import texels as own_texels
 from hesim_render.sources.render.transport.texels import Texels
 from hesim_render.spectral.spectrum import Spectrum, illuminant, integrate_product
 from hesim_render.targets.piece import Picture
@@ -56,8 +57,12 @@ def integrals(texture, u, v, level, response):
 @pytest.mark.parametrize("repeat", [None, (2, 3)])
 @pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
 @pytest.mark.parametrize("lights, filters", [(1, 1), (2, 2)])
-def test_texels_hold_the_integrals_of_mitsubas_textures(lights, filters, interpolation, repeat):
-    """Places within the picture and beyond it; three pictures one after the other, of one light and filter as well."""
+def test_texels_hold_the_integrals_of_mitsubas_textures(lights, filters, interpolation, repeat, monkeypatch):
+    """Places within the picture and beyond it; three pictures one after the other, of one light and filter as well.
+
+    With two lights, two rows at a time are integrated, and the last one by itself.
+    """
+    monkeypatch.setattr(own_texels, "_TEXELS_AT_ONCE", 10 if lights == 2 else 1 << 20)
     mi, rng = mitsuba(), np.random.default_rng(17)
     levels, responses = LEVELS[-lights:], RESPONSES[:filters]
     pictures = [picture(kind, interpolation, rng) for kind in KINDS]

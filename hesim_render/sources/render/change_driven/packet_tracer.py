@@ -130,6 +130,8 @@ class PacketTracer(Tracer):
             self._integrator = DiffuseIntegrator(
                 self.parts, self.built.paints, scene.spec.lights, self.sensor.responses
             )
+            # pictures are large, and the integrator has what it needs of them
+            self.built.paints = None
         else:
             depth, roulette = path_depths(self.built.integrator)
             self._integrator = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))

@@ -5,7 +5,7 @@ between texels. The integral is therefore computed for each texel, light and fil
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 
 import numpy as np
@@ -74,7 +74,7 @@ class Texels:
             parts.append(values.ravel())
         # whole numbers, which a Float does not hold beyond 2²⁴
         self._rows = from_host(mi.UInt32, rows.astype(np.uint32))
-        self._values = from_host(mi.Float, np.concatenate(parts))
+        self._values = from_host(mi.Float, parts[0] if len(parts) == 1 else np.concatenate(parts))
         dr.make_opaque(self._rows, self._values)
 
     def at(self, number: UInt32, place: Point2, active: Mask) -> Texel:
@@ -143,13 +143,19 @@ def _factors(
     weights = CubicSpline(knots, np.eye(knots.size))(fine).T @ np.stack(
         [_weights(fine, *pair) for pair in pairs], axis=1
     )
-    # Mitsuba's own coefficients of its smooth spectra, as they are rendered
-    coefficients = np.array(mi.traverse(mi.load_dict(picture_texture(mi, picture)))["data"])
-    out = np.empty((*coefficients.shape[:2], len(pairs)), np.float32)
-    flat, into = coefficients.reshape(-1, 3), out.reshape(-1, len(pairs))
-    for begin in range(0, len(flat), _TEXELS_AT_ONCE):
-        some = slice(begin, begin + _TEXELS_AT_ONCE)
-        into[some] = _integrals(mi, flat[some], knots, weights)
+    flipped = picture.values[::-1]
+    height, width = flipped.shape[:2]
+    out = np.empty((height, width, len(pairs)), np.float32)
+    at_once = max(1, _TEXELS_AT_ONCE // width)
+    for begin in range(0, height, at_once):
+        rows = flipped[begin : begin + at_once]
+        # Mitsuba's own coefficients of its smooth spectra, as they are rendered; it doubles single rows and columns
+        texture = mi.load_dict(picture_texture(mi, replace(picture, values=rows[::-1])))
+        coefficients = np.array(mi.traverse(texture)["data"])[: len(rows), :width]
+        out[begin : begin + at_once] = _integrals(mi, coefficients.reshape(-1, 3), knots, weights).reshape(
+            *rows.shape[:2], -1
+        )
+    dr.flush_malloc_cache()
     return out
 
 
