@@ -103,7 +103,8 @@ class AdaptiveRenderer:
         index, lattice = self.index[pixel], self.noise.lattice(role)
         apart, tuning = self.noise.is_apart(role), self.tuning
         rays = tuning.lone_pilot_rays if apart else tuning.pilot_rays
-        # where edges cross a pixel within a window, or texels, strata gain less; a pilot in a wide area sees more
+        # where edges or texels cross a pixel within a window, strata gain less; a pilot in a wide area sees more than
+        # its pixel
         quality, mild = self.quality, self.tracer.is_plain and (apart or not self.has_ticks)
         if role == "any":
             rays, quality, mild = tuning.frame_pilot_rays, quality / tuning.frame_margin, False

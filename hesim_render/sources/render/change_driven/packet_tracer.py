@@ -130,7 +130,7 @@ class PacketTracer(Tracer):
             self._integrator = DiffuseIntegrator(
                 self.parts, self.built.paints, scene.spec.lights, self.sensor.responses
             )
-            # pictures are large, and the integrator has what it needs of them
+            # the integrator has what it needs of the pictures, which are large
             self.built.paints = None
         else:
             depth, roulette = path_depths(self.built.integrator)

@@ -35,6 +35,7 @@ from hesim_render.sources.render.scene.surfaces import (
     bsdf_of,
     is_diffuse,
     paint_of,
+    picture_of,
     pictured,
     radiance_of,
 )
@@ -59,7 +60,8 @@ class BuiltScene:
     groups : movable shapes by name: ``target``, an object's name, a Mitsuba shape id.
     trajectories : tracks of the groups that really move.
     is_dark : True where nothing emits.
-    paints : paint of all shapes except lamps, if all are diffuse and the light is direct; otherwise None.
+    paints : paint of all shapes except lamps, if all are diffuse and the light is direct; otherwise None. What traces
+        the scene takes it, because pictures in it are large.
     exact_because : why the scene needs the exact mode; None if it does not.
     camera : the Mitsuba scene's own camera, if it is used.
     integrator_plugin : plugin description of a Mitsuba scene's integrator; None if it was given as an object.
@@ -219,7 +221,8 @@ def _describe(
                 paints.append(Paint(name, (piece.reflectance,)))
     for number, item in enumerate(spec.objects):
         name = f"object_{number}"
-        placement, bsdf = _placement(item), bsdf_of(mi, item, spec)
+        picture = picture_of(item)
+        placement, bsdf = _placement(item), bsdf_of(mi, item, spec, picture)
         if item.shape == "mesh":
             anywhere = spec.allow_outside or spec.file is None
             parts, deformation = mesh_shapes(mi, item, name, placement, bsdf, spec.folder, anywhere)
@@ -230,7 +233,7 @@ def _describe(
         content.update(parts)
         groups[item.name] = list(parts)
         if is_diffuse(item):
-            paints += [paint_of(item, part) for part in parts]
+            paints += [paint_of(item, part, picture) for part in parts]
         else:
             all_diffuse = False
     try:

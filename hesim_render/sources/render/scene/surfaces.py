@@ -63,6 +63,11 @@ def reflects_diffusely(mi: MitsubaModule, bsdf: MitsubaObject | None) -> bool:
     return flags is not None and not any(mi.has_flag(flags, other) for other in others)
 
 
+def picture_of(item: ObjectSpec) -> Picture | None:
+    """The picture on an object, read from its file; None for none."""
+    return None if item.texture is None else read_picture(item.texture, f"objects.{item.name}.texture")
+
+
 def pictured(shape: str, picture: Picture, repeat: tuple[int, int] | None = None, two_sided: bool = False) -> Paint:
     """The paint of a shape whose picture is seen `repeat` times along u and v; None: once, and its rim beyond."""
     across, up = repeat or (1, 1)
@@ -70,10 +75,9 @@ def pictured(shape: str, picture: Picture, repeat: tuple[int, int] | None = None
     return Paint(shape, (white,), (float(across), float(up)), two_sided, picture, repeat is not None)
 
 
-def paint_of(item: ObjectSpec, name: str) -> Paint:
-    """The paint of a diffuse object's shape."""
-    if item.texture is not None:
-        picture = read_picture(item.texture, f"objects.{item.name}.texture")
+def paint_of(item: ObjectSpec, name: str, picture: Picture | None) -> Paint:
+    """The paint of a diffuse object's shape; `picture` is the object's."""
+    if picture is not None and item.texture is not None:
         return pictured(name, picture, item.texture.repeat, item.shape in _OPEN_SHAPES)
     colours = [source.load() for source in (item.reflectance, item.pattern) if source is not None]
     u, v = item.pattern_count
@@ -84,7 +88,7 @@ def are_few(paints: Sequence[Paint], colours: int) -> bool:
     """True if the texels of all pictures fit into memory with `colours` numbers each, one for each light and filter; a
     grey texel has one.
     """
-    pictures = [paint.picture for paint in paints if paint.picture is not None]
+    pictures = {paint.picture for paint in paints if paint.picture is not None}
     sizes = [picture.values[..., 0].size * (1 if picture.kind == "grey" else colours) for picture in pictures]
     return sum(sizes) <= _MOST_ENTRIES
 
@@ -99,8 +103,9 @@ def area_emitter(radiance: Spectrum | None) -> dict[str, Any] | None:
     return None if radiance is None else {"type": "area", "radiance": spectrum_dict(radiance)}
 
 
-def bsdf_of(mi: MitsubaModule, item: ObjectSpec, spec: SceneSpec) -> Any:
-    """BSDF of an object, or its dictionary for Mitsuba. Open shapes that reflect only do so on both sides.
+def bsdf_of(mi: MitsubaModule, item: ObjectSpec, spec: SceneSpec, picture: Picture | None) -> Any:
+    """BSDF of an object, which may have a picture, or its dictionary for Mitsuba. Open shapes that reflect only do so
+    on both sides.
 
     Raises
     ------
@@ -110,8 +115,8 @@ def bsdf_of(mi: MitsubaModule, item: ObjectSpec, spec: SceneSpec) -> Any:
     key = f"objects.{item.name}.material"
     if item.material is not None:
         bsdf = _plugin(mi, item.material, item, spec, key, "BSDF")
-    elif item.texture is not None:
-        bsdf = {"type": "diffuse", "reflectance": _picture(mi, item.texture, f"objects.{item.name}.texture")}
+    elif picture is not None and item.texture is not None:
+        bsdf = {"type": "diffuse", "reflectance": picture_texture(mi, picture, item.texture.repeat)}
     else:
         bsdf = {"type": "diffuse", "reflectance": _colours(mi, item)}
     is_open = item.shape in _OPEN_SHAPES

@@ -104,21 +104,22 @@ class DiffuseIntegrator:
         black = constant(0.0)
         colours: list[Spectrum] = [black]
         rows: dict[str, list[float]] = {}
-        pictures: list[tuple[Picture, bool]] = []
+        # numbers from 1, of pictures that repeat or not; parts of an object share one
+        pictures: dict[tuple[Picture, bool], int] = {}
         for paint in paints:
             numbers = [len(colours) + k for k in range(len(paint.colours))]
             colours += paint.colours
-            number_of_picture = 0.0
+            own = 0
             if paint.picture is not None:
-                pictures.append((paint.picture, paint.repeats))
-                number_of_picture = float(len(pictures))
-            both = float(paint.two_sided)
-            rows[paint.shape] = [numbers[0], numbers[-1], both, 0.0, *paint.scale, number_of_picture, 0.0]
+                own = pictures.setdefault((paint.picture, paint.repeats), len(pictures) + 1)
+            rows[paint.shape] = [numbers[0], numbers[-1], float(paint.two_sided), 0.0, *paint.scale, own, 0.0]
         for name, number in lamp_of.items():
             rows[name] = [0.0, 0.0, 0.0, number + 1.0, 1.0, 1.0, 0.0, 0.0]
         self._has_checks = any(len(paint.colours) > 1 for paint in paints)
         self._tables(rows, colours, irradiances, strengths, list(responses.values()))
-        self._texels = Texels(scene.mi, pictures, irradiances, list(responses.values())) if pictures else None
+        of_lights = irradiances, list(responses.values())
+        # without light there is nothing to see of a picture
+        self._texels = Texels(scene.mi, list(pictures), *of_lights) if pictures and irradiances else None
         dr.make_opaque(self._rows, self._reflected, self._emitted, self._filters, self._colours)
 
     def _tables(
@@ -192,8 +193,7 @@ class DiffuseIntegrator:
             beyond = (place - dr.floor(place)) > 0.5
             colour = dr.select(beyond.x == beyond.y, one, other)
             if self._texels is not None:
-                has_picture = hit & (picture > 0)
-                texel = self._texels.at(mi.UInt32(dr.maximum(picture - 1, 0)), place, has_picture)
+                texel = self._texels.at(mi.UInt32(dr.maximum(picture - 1, 0)), place, hit & (picture > 0))
 
         # light sources that the ray hits
         emits = dr.select(hit, (lamp > 0) & front, self._has_sky)
@@ -218,9 +218,7 @@ class DiffuseIntegrator:
                 asks,
             )
             if self._texels is not None and texel is not None:
-                seen_texel = asks & has_picture
-                of_texel = self._texels.factor(texel, number * self._filters + filter_index, scale, seen_texel)
-                scale = dr.select(seen_texel, of_texel, scale)
+                scale = self._texels.factor(texel, number * self._filters + filter_index, scale, asks)
             known = open_
             if shadows is not None and self._shadows is not None and isinstance(light, _Lamp):
                 of = normal, shadow, moment, dr.select(asks, shadows, 0)

@@ -37,11 +37,13 @@ class Texel:
     ----------
     entries : first entry of each of the four texels around.
     weights : of these texels.
+    is_seen : True where there is a picture.
     has_spectrum : True where a texel has entries of its own for each light and filter.
     """
 
     entries: tuple[UInt32, UInt32, UInt32, UInt32]
     weights: tuple[Float, Float, Float, Float]
+    is_seen: Mask
     has_spectrum: Mask
 
 
@@ -84,7 +86,7 @@ class Texels:
         ----------
         number : of the picture, in the order given.
         place : (u, v); (0, 0) is the lower left corner of the picture, (1, 1) the upper right one.
-        active : lanes that see a picture.
+        active : True where there is a picture.
         """
         mi = self._mi
         begin, width, height, entries = dr.gather(mi.Vector4u, self._rows, 2 * number, active)
@@ -106,23 +108,24 @@ class Texels:
         texels = (low, left), (low, right), (high, left), (high, right)
         first_entries = [begin + (row * width + col) * entries for row, col in texels]
         weights = [(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y]
-        return Texel(tuple(first_entries), tuple(weights), is_grey == 0)
+        return Texel(tuple(first_entries), tuple(weights), active, is_grey == 0)
 
-    def factor(self, texel: Texel, entry: UInt32, grey: Float, active: Mask) -> Float:
-        """∫ R(λ) ρ(λ)/π S_k(λ) dλ of what rays see, e⁻/s.
+    def factor(self, texel: Texel, entry: UInt32, paint: Float, active: Mask) -> Float:
+        """∫ R(λ) ρ(λ)/π S_k(λ) dλ of what rays see, e⁻/s: of a picture where there is one, else `paint`.
 
         Parameters
         ----------
         texel : from `at`.
         entry : number of light and filter, light · filters + filter.
-        grey : the integral of a reflectance of 1.
-        active : lanes that see a picture.
+        paint : the integral of the surface's paint; that of a surface with a picture is white.
+        active : lanes that count.
         """
-        own = dr.select(texel.has_spectrum, entry, 0)
+        active, own = active & texel.is_seen, dr.select(texel.has_spectrum, entry, 0)
         sum_ = self._mi.Float(0)
         for first, weight in zip(texel.entries, texel.weights, strict=True):
             sum_ = dr.fma(weight, dr.gather(self._mi.Float, self._values, first + own, active), sum_)
-        return dr.select(texel.has_spectrum, sum_, sum_ * grey)
+        # the texels of a grey picture are parts of white
+        return dr.select(active, dr.select(texel.has_spectrum, sum_, sum_ * paint), paint)
 
 
 def _factors(
@@ -140,9 +143,9 @@ def _factors(
         return (picture.values[::-1] @ weights.astype(np.float32)).astype(np.float32)
     low, high = (each(end) for each, end in zip((min, max), _ends(pairs), strict=True))
     knots, fine = (np.linspace(low, high, ceil((high - low) / step) + 4) for step in (_STEP_NM, _FINE_NM))
-    weights = CubicSpline(knots, np.eye(knots.size))(fine).T @ np.stack(
-        [_weights(fine, *pair) for pair in pairs], axis=1
-    )
+    linear = np.stack([_weights(fine, *pair) for pair in pairs], axis=1)
+    # values between the knots are those of a spline, which is linear in the values at the knots
+    weights = CubicSpline(knots, np.eye(knots.size))(fine).T @ linear
     flipped = picture.values[::-1]
     height, width = flipped.shape[:2]
     out = np.empty((height, width, len(pairs)), np.float32)
@@ -152,9 +155,8 @@ def _factors(
         # Mitsuba's own coefficients of its smooth spectra, as they are rendered; it doubles single rows and columns
         texture = mi.load_dict(picture_texture(mi, replace(picture, values=rows[::-1])))
         coefficients = np.array(mi.traverse(texture)["data"])[: len(rows), :width]
-        out[begin : begin + at_once] = _integrals(mi, coefficients.reshape(-1, 3), knots, weights).reshape(
-            *rows.shape[:2], -1
-        )
+        integrals = _integrals(mi, coefficients.reshape(-1, 3), knots, weights)
+        out[begin : begin + at_once] = integrals.reshape(len(rows), width, -1)
     dr.flush_malloc_cache()
     return out
 
