@@ -413,6 +413,27 @@ def test_a_scene_of_mitsubas_has_its_own_names():
     assert len(np.unique(ids.material)) >= 3
 
 
+def test_shapes_without_an_id_have_names_of_their_own(tmp_path):
+    """The left and the right half of the picture show two of them; one has what would be the name of the other."""
+    left, right = (
+        f'<shape type="rectangle"{own}><transform name="to_world"><translate x="{x}"/></transform></shape>'
+        for own, x in (("", -1), (' id="shape_2"', 3))
+    )
+    (tmp_path / "two.xml").write_text(
+        f'<scene version="3.0.0">{left}{right}{left.replace("-1", "1.03")}<emitter type="constant"/></scene>'
+    )
+    (tmp_path / "two.yaml").write_text(
+        "schema_version: 1\nname: two\ndescription: ''\nmitsuba: {file: two.xml}\n"
+        "camera: {origin_m: [0, 0, 2], target_m: [0, 0, 0], horizontal_fov_deg: 22.62}\n"
+    )
+    truth = SceneTruth(hr.load_scene(tmp_path / "two.yaml"), rendering.mono(40, 30))
+    ids = truth.ids(0)
+    names = np.array(truth.names.objects)[ids.object]
+    assert list(truth.names.objects) == ["background", "shape_0", "shape_2", "shape_2_"]
+    assert (names[:, :19] == "shape_0").all() and (names[:, 23:] == "shape_2_").all()
+    assert (np.array(truth.names.instances)[ids.instance] == names).all()
+
+
 def test_times_and_grids_that_are_none_are_refused(truth):
     with pytest.raises(RangeError, match="one time in µs, one for each of the 96 rows"):
         truth.depth([1.0, 2.0])

@@ -126,12 +126,10 @@ class PacketTracer(Tracer):
         self.rays.require_one_path()
         self.parts = MovingScene(self.built)
         self._integrator: DiffuseIntegrator | PathIntegrator
-        if self.built.paints is not None:
-            self._integrator = DiffuseIntegrator(
-                self.parts, self.built.paints, scene.spec.lights, self.sensor.responses
-            )
+        if self.built.matt is not None:
+            self._integrator = DiffuseIntegrator(self.parts, self.built.matt, self.sensor.responses)
             # the integrator has what it needs of the pictures, which are large
-            self.built.paints = None
+            self.built.matt = None
         else:
             depth, roulette = path_depths(self.built.integrator)
             self._integrator = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))

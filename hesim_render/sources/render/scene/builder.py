@@ -11,6 +11,8 @@ from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene import lights
 from hesim_render.sources.render.scene.deformation import Deformation
+from hesim_render.sources.render.scene.direct_lights import direct_lights
+from hesim_render.sources.render.scene.matt_scene import MattScene
 from hesim_render.sources.render.scene.mesh_file import mesh_shapes
 from hesim_render.sources.render.scene.mitsuba_scene import MitsubaCamera, load_mitsuba, path_tracer
 from hesim_render.sources.render.scene.mitsuba_version import (
@@ -21,6 +23,7 @@ from hesim_render.sources.render.scene.mitsuba_version import (
     files_readable,
     make_mesh,
     number_of,
+    path_depths,
     settle_normals,
     spectrum_dict,
     transform,
@@ -60,8 +63,8 @@ class BuiltScene:
     groups : movable shapes by name: ``target``, an object's name, a Mitsuba shape id.
     trajectories : tracks of the groups that really move.
     is_dark : True where nothing emits.
-    paints : paint of all shapes except lamps, if all are diffuse and the light is direct; otherwise None. What traces
-        the scene takes it, because pictures in it are large.
+    matt : surfaces and lights, if all surfaces are diffuse, the light is direct, and that of all lights has a closed
+        form; otherwise None. What traces the scene takes it, because pictures in it are large.
     exact_because : why the scene needs the exact mode; None if it does not.
     camera : the Mitsuba scene's own camera, if it is used.
     integrator_plugin : plugin description of a Mitsuba scene's integrator; None if it was given as an object.
@@ -77,7 +80,7 @@ class BuiltScene:
     groups: dict[str, list[Movable]]
     trajectories: dict[str, Trajectory]
     is_dark: bool
-    paints: list[Paint] | None
+    matt: MattScene | None
     exact_because: str | None = None
     camera: MitsubaCamera | None = None
     integrator_plugin: dict[str, Any] | None = None
@@ -149,17 +152,14 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
         plugin = loaded.integrator_plugin
         groups: dict[str, list[str]] = {}
         deformations: dict[str, Deformation] = {}
-        paints = None
+        matt = loaded.matt
     else:
-        content, groups, paints, deformations = _describe(mi, spec)
+        content, groups, matt, deformations = _describe(mi, spec)
         if deformations:
             because = f"object {next(iter(deformations))!r} changes its shape"
         with as_spec_error(spec.file):
             scene = mi.load_dict({"type": "scene", **content}, optimize=False)
         integrator = path_tracer(mi, spec.depth)
-        filters = 1 if responses is None else len(responses)
-        if paints is not None and not are_few(paints, len(spec.lights) * filters):
-            paints = None
     parameters = mi.traverse(scene)
     if spec.mitsuba is None:
         without = {name for item in spec.objects for name in _without_normals(item, spec, groups)}
@@ -187,7 +187,7 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
         groups=movable,
         trajectories={name: track for name, track in tracks.items() if track.moves},
         is_dark=len(scene.emitters()) == 0,
-        paints=paints if spec.depth == 2 else None,
+        matt=matt if _is_direct(integrator) and _fits(matt, responses) else None,
         exact_because=because,
         camera=camera,
         integrator_plugin=plugin,
@@ -196,11 +196,22 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
     )
 
 
+def _is_direct(integrator: MitsubaObject) -> bool:
+    """True if light is followed from its sources to one surface."""
+    return integrator.class_name() in ("DirectIntegrator", "PathIntegrator") and path_depths(integrator)[0] == 2
+
+
+def _fits(matt: MattScene | None, responses: Mapping[str, Spectrum] | None) -> bool:
+    """True if the numbers of all texels fit into memory."""
+    filters = 1 if responses is None else len(responses)
+    return matt is not None and are_few(matt.paints, len(matt.lights) * filters)
+
+
 def _describe(
     mi: MitsubaModule, spec: SceneSpec
-) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint] | None, dict[str, Deformation]]:
-    """Mitsuba's dictionary of a scene file, the shape ids of each movable name, the paint of the shapes (None if
-    a shape shines or has a picture), and the objects that change their shape.
+) -> tuple[dict[str, Any], dict[str, list[str]], MattScene | None, dict[str, Deformation]]:
+    """Mitsuba's dictionary of a scene file, the shape ids of each movable name, surfaces and lights (None if a shape
+    shines or is not diffuse), and the objects that change their shape.
     """
     deformations: dict[str, Deformation] = {}
     all_diffuse = True
@@ -241,7 +252,8 @@ def _describe(
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
     has_map = any(light.type == "environment" for light in spec.lights)
-    return content, groups, paints if all_diffuse and not has_map else None, deformations
+    matt = MattScene(paints, direct_lights(spec.lights)) if all_diffuse and not has_map else None
+    return content, groups, matt, deformations
 
 
 def _without_normals(item: ObjectSpec, spec: SceneSpec, groups: Mapping[str, list[str]]) -> list[str]:

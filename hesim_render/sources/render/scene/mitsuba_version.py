@@ -218,6 +218,18 @@ def vertex_normals(parameters: MitsubaObject, prefix: str) -> NDArray[np.float64
     return np.array(parameters[key], dtype=np.float64).reshape(-1, 3)
 
 
+def names_of(shapes: Sequence[MitsubaObject]) -> list[str]:
+    """Names of a scene's shapes: their ids, and ``shape_3`` for the fourth one if that has none."""
+    names = [shape.id() for shape in shapes]
+    for number, name in enumerate(names):
+        if not name:
+            own = f"shape_{number}"
+            while own in names:
+                own += "_"
+            names[number] = own
+    return names
+
+
 def settle_normals(parameters: MitsubaObject, needs_normals: Callable[[str], bool]) -> None:
     """Give meshes the normals that their vertices determine, in place of Mitsuba's, whose last bits are by chance.
 

@@ -1,9 +1,11 @@
 """Pictures of targets and surfaces as textures of Mitsuba."""
 
 import functools
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Interaction, Mask, MitsubaModule
@@ -11,6 +13,26 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.mitsuba_version import transform
 from hesim_render.targets.piece import Picture
+
+
+@dataclass(frozen=True, eq=False)
+class TextureData:
+    """A picture as a bitmap texture of Mitsuba holds it.
+
+    Parameters
+    ----------
+    values : float32 [row, col, channel], the row with v = 0 first: one channel of grey reflectances, or three
+        coefficients of smooth spectra [jakob2019].
+    interpolation : between texels, ``bilinear`` or ``nearest``.
+    """
+
+    values: NDArray[np.float32]
+    interpolation: str
+
+    @property
+    def kind(self) -> str:
+        """``grey`` or ``smooth``."""
+        return "grey" if self.values.shape[2] == 1 else "smooth"
 
 
 def picture_texture(mi: MitsubaModule, picture: Picture, repeat: tuple[int, int] | None = None) -> Any:

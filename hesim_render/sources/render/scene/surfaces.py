@@ -10,7 +10,7 @@ from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.files import require_material
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, spectrum_dict, transform
-from hesim_render.sources.render.scene.pictures import picture_texture
+from hesim_render.sources.render.scene.pictures import TextureData, picture_texture
 from hesim_render.sources.render.scene.plugin_tables import HONOURED, REFUSED
 from hesim_render.sources.render.scene.sizes import require_fits
 from hesim_render.specs.reflectance import TextureSpec
@@ -32,7 +32,7 @@ class Paint:
 
     Parameters
     ----------
-    shape : id of the shape in the Mitsuba scene.
+    shape : name of the shape in the Mitsuba scene.
     colours : one or two reflectances; 1 with a picture.
     scale : factors on (u, v) of the shape; the squares of the checkerboard then have a side of one half, the picture
         one of 1.
@@ -45,7 +45,7 @@ class Paint:
     colours: tuple[Spectrum, ...]
     scale: tuple[float, float] = (1.0, 1.0)
     two_sided: bool = False
-    picture: Picture | None = None
+    picture: Picture | TextureData | None = None
     repeats: bool = False
 
 

@@ -19,11 +19,10 @@ A path tracer with multiple importance sampling [veach1997] estimates the produc
 dark side of a penumbra its error was three times as large, with more rays.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import pi
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import (
@@ -36,8 +35,9 @@ from hesim_render.core.device_types import (
     Vector3,
 )
 from hesim_render.core.host_arrays import from_host
-from hesim_render.sources.render.scene import lights
-from hesim_render.sources.render.scene.surfaces import Paint
+from hesim_render.sources.render.scene.direct_lights import DirectLight
+from hesim_render.sources.render.scene.matt_scene import MattScene
+from hesim_render.sources.render.scene.pictures import TextureData
 from hesim_render.sources.render.transport.irradiance import RectangleLight
 from hesim_render.sources.render.transport.leaving import Leaving
 from hesim_render.sources.render.transport.moving_scene import MovingScene
@@ -45,13 +45,14 @@ from hesim_render.sources.render.transport.occluded_lamps import SLOTS, LampShad
 from hesim_render.sources.render.transport.outlines import OccludedSky
 from hesim_render.sources.render.transport.swept_boxes import Moment
 from hesim_render.sources.render.transport.texels import Texels
-from hesim_render.specs.light import LightSpec, irradiance
-from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product, summed
+from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product
 from hesim_render.targets.piece import Picture
 
-#: Columns of a shape's row in the table of paints: number of its one or two colours, whether both sides are painted,
+#: Columns of a shape's row in the table of paints: number of its one or two colours, how many of its sides are painted,
 #: number of its lamp from 1, the scale of its checks or picture, and the number of its picture from 1.
 _ROW = 8
+#: Row of a shape without paint: its front is black.
+_BLACK = (0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0)
 
 
 class DiffuseIntegrator:
@@ -60,62 +61,38 @@ class DiffuseIntegrator:
     Parameters
     ----------
     scene : the scene to trace.
-    paints : paint of all shapes except lamps.
-    given : lights of the scene file, in its order.
+    matt : its paints and lights.
     responses : R per filter, in the order of the filter index; e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹.
     """
 
-    def __init__(
-        self,
-        scene: MovingScene,
-        paints: Sequence[Paint],
-        given: Sequence[LightSpec],
-        responses: Mapping[str, Spectrum],
-    ) -> None:
+    def __init__(self, scene: MovingScene, matt: MattScene, responses: Mapping[str, Spectrum]) -> None:
         self._scene = scene
-        levels = [irradiance(light) for light in given]
-        skies = [level for light, level in zip(given, levels, strict=True) if light.type == "uniform" and level]
-        #: Lights that are on: S_k, and an object that computes e_k and draws a point; a uniform sky comes last.
-        self._lights: list[_Lamp | _Beam | _Point | _Sky] = []
-        strengths: list[Spectrum] = []
-        lamp_of: dict[str, int] = {}
-        for number, (light, level) in enumerate(zip(given, levels, strict=True)):
-            if level is None or light.type == "uniform":
-                continue
-            geometry = lights.geometry_on_plane(light, lights.key_of(given, number))
-            if light.type == "area":
-                lamp_of[lights.name_of(given, number)] = len(self._lights)
-                self._lights.append(_Lamp(scene.leaving, lights.area_light_frame(light), geometry))
-            elif light.type == "point":
-                self._lights.append(_Point(scene.leaving, np.array(light.position_m, np.float64), geometry))
-            else:
-                self._lights.append(_Beam(scene.leaving, lights.beam_direction(light), geometry))
-            # a ray that hits the light itself carries S_k/geometry
-            strengths.append(level.scaled(1 / geometry))
-        irradiances = [level for light, level in zip(given, levels, strict=True) if level and light.type != "uniform"]
-        if skies:
-            sky = summed(*skies) if len(skies) > 1 else skies[0]
-            self._lights.append(_Sky(scene.leaving))
-            irradiances.append(sky)
-            strengths.append(sky.scaled(1 / pi))
-        self._has_sky = bool(skies)
-        self._outlines = OccludedSky(scene) if skies else None
+        #: Objects that compute e_k and draw a point, in the order of the scene's lights.
+        self._lights: list[_Lamp | _Beam | _Point | _Sky] = [
+            _SEEN_AS[light.kind](scene.leaving, light) for light in matt.lights
+        ]
+        irradiances = [light.level for light in matt.lights]
+        # a ray that hits the light itself carries its strength
+        strengths = [light.strength for light in matt.lights]
+        lamp_of = {light.shape: number for number, light in enumerate(matt.lights) if light.shape is not None}
+        self._has_sky = bool(matt.lights) and matt.lights[-1].kind == "sky"
+        self._outlines = OccludedSky(scene) if self._has_sky else None
         self._shadows = LampShadows(scene) if lamp_of else None
         black = constant(0.0)
         colours: list[Spectrum] = [black]
         rows: dict[str, list[float]] = {}
         # numbers from 1, of pictures that repeat or not; parts of an object share one
-        pictures: dict[tuple[Picture, bool], int] = {}
-        for paint in paints:
+        pictures: dict[tuple[Picture | TextureData, bool], int] = {}
+        for paint in matt.paints:
             numbers = [len(colours) + k for k in range(len(paint.colours))]
             colours += paint.colours
             own = 0
             if paint.picture is not None:
                 own = pictures.setdefault((paint.picture, paint.repeats), len(pictures) + 1)
-            rows[paint.shape] = [numbers[0], numbers[-1], float(paint.two_sided), 0.0, *paint.scale, own, 0.0]
-        for name, number in lamp_of.items():
-            rows[name] = [0.0, 0.0, 0.0, number + 1.0, 1.0, 1.0, 0.0, 0.0]
-        self._has_checks = any(len(paint.colours) > 1 for paint in paints)
+            rows[paint.shape] = [numbers[0], numbers[-1], 1.0 + paint.two_sided, 0.0, *paint.scale, own, 0.0]
+        for shape, number in lamp_of.items():
+            rows.setdefault(shape, [0.0] * _ROW)[3] = number + 1.0
+        self._has_checks = any(len(paint.colours) > 1 for paint in matt.paints)
         self._tables(rows, colours, irradiances, strengths, list(responses.values()))
         of_lights = irradiances, list(responses.values())
         # without light there is nothing to see of a picture
@@ -137,7 +114,7 @@ class DiffuseIntegrator:
         numbers = {}
         for name, shape in self._scene.shapes.items():
             number: UInt32 = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
-            numbers[int(number[0])] = rows.get(name, [0.0] * _ROW)
+            numbers[int(number[0])] = rows.get(name, _BLACK)
         rows_of = np.zeros((max(numbers, default=0) + 1, _ROW))
         for place, row in numbers.items():
             rows_of[place] = row
@@ -184,7 +161,7 @@ class DiffuseIntegrator:
         hit = si.is_valid()
         which: UInt32 = dr.reinterpret_array(mi.UInt32, si.shape)
         first = 2 * dr.select(hit, which, 0)
-        one, other, both, lamp = dr.gather(mi.Vector4f, self._rows, first)
+        one, other, sides, lamp = dr.gather(mi.Vector4f, self._rows, first)
         front = mi.Frame3f.cos_theta(si.wi) > 0
         colour, texel = one, None
         if self._has_checks or self._texels is not None:
@@ -202,13 +179,14 @@ class DiffuseIntegrator:
         seen = dr.gather(mi.Float, self._emitted, source * self._filters + filter_index, emits)
 
         # light that a painted surface reflects
-        painted = hit & (lamp == 0) & (front | (both > 0))
+        painted = hit & (front & (sides > 0) | (sides > 1))
         normal = mi.Vector3f(surface.shading_normal)
         normal = dr.select(front, normal, -normal)
         controlled, plain, unshadowed = seen, seen, seen
         for number, light in enumerate(self._lights):
             open_, share, shadow = light.seen_from(surface.world, normal, sampler)
-            asks = painted & (open_ > 0)
+            # a lamp that is painted as well gives no light to itself; rounding would say it does
+            asks = painted & (open_ > 0) & (lamp != number + 1)
             blocked, near = scene.occluded(shadow, moment, asks)
             met |= near
             scale = dr.gather(
@@ -272,9 +250,9 @@ class DiffuseIntegrator:
 class _Lamp:
     """A rectangle light; its strength is its radiance."""
 
-    def __init__(self, leaving: Leaving, frame: NDArray[np.float64], geometry: float) -> None:
-        self.rectangle, self._leaving = RectangleLight(leaving.mi, frame), leaving
-        self.scale = dr.opaque(leaving.mi.Float, 1 / geometry)
+    def __init__(self, leaving: Leaving, light: DirectLight) -> None:
+        self.rectangle, self._leaving = RectangleLight(leaving.mi, light.place), leaving
+        self.scale = dr.opaque(leaving.mi.Float, 1 / light.geometry)
 
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
         """e_k and r at surface points, and the shadow ray to the point drawn on the light.
@@ -293,9 +271,9 @@ class _Lamp:
 class _Point:
     """A point light; its strength is its intensity."""
 
-    def __init__(self, leaving: Leaving, position: NDArray[np.float64], geometry: float) -> None:
+    def __init__(self, leaving: Leaving, light: DirectLight) -> None:
         mi, self._leaving = leaving.mi, leaving
-        self._position, self._scale = mi.Point3f(position), dr.opaque(mi.Float, 1 / geometry)
+        self._position, self._scale = mi.Point3f(light.place), dr.opaque(mi.Float, 1 / light.geometry)
         dr.make_opaque(self._position)
 
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
@@ -309,9 +287,9 @@ class _Point:
 class _Beam:
     """Parallel light; its strength is the irradiance across the beam."""
 
-    def __init__(self, leaving: Leaving, direction: NDArray[np.float64], geometry: float) -> None:
+    def __init__(self, leaving: Leaving, light: DirectLight) -> None:
         mi, self._leaving = leaving.mi, leaving
-        self._towards, self._scale = mi.Vector3f(-direction), dr.opaque(mi.Float, 1 / geometry)
+        self._towards, self._scale = mi.Vector3f(-light.place), dr.opaque(mi.Float, 1 / light.geometry)
         dr.make_opaque(self._towards)
 
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
@@ -323,7 +301,7 @@ class _Beam:
 class _Sky:
     """Uniform light from all directions; its strength is its radiance, and e_k is 1."""
 
-    def __init__(self, leaving: Leaving) -> None:
+    def __init__(self, leaving: Leaving, light: DirectLight) -> None:
         self._leaving = leaving
 
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
@@ -331,3 +309,7 @@ class _Sky:
         mi = self._leaving.mi
         local = mi.warp.square_to_cosine_hemisphere(sampler.surface_2d())
         return mi.Float(1.0), mi.Float(1.0), self._leaving.along(point, mi.Frame3f(normal).to_world(local))
+
+
+_SEEN_AS: dict[str, Callable[[Leaving, DirectLight], _Lamp | _Point | _Beam | _Sky]]
+_SEEN_AS = {"rectangle": _Lamp, "point": _Point, "beam": _Beam, "sky": _Sky}

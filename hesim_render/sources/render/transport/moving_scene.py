@@ -30,6 +30,7 @@ from hesim_render.core.device_types import (
 )
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.builder import BuiltScene, NeedsExactMode, require_paths
+from hesim_render.sources.render.scene.mitsuba_version import names_of
 from hesim_render.sources.render.scene.surfaces import reflects_diffusely
 from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
 from hesim_render.sources.render.scene.trajectory import Trajectory
@@ -139,8 +140,8 @@ class MovingScene:
         built.rest()
         parts: dict[str, dict[str, Any]] = {name: {} for name in built.trajectories}
         resting: dict[str, Any] = {}
-        #: All shapes by their ids in the loaded scene; Mitsuba gives them other ids in the scenes made here.
-        self.shapes = {shape.id(): shape for shape in built.scene.shapes()}
+        #: All shapes by their names in the loaded scene; Mitsuba gives them other ids in the scenes made here.
+        self.shapes = dict(zip(names_of(built.scene.shapes()), built.scene.shapes(), strict=True))
         for number, shape in enumerate(built.scene.shapes()):
             group = moving.get(shape.id())
             if group is None:

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, Mask, MitsubaModule, Point2, UInt32
 from hesim_render.core.host_arrays import from_host
-from hesim_render.sources.render.scene.pictures import picture_texture
+from hesim_render.sources.render.scene.pictures import TextureData, picture_texture
 from hesim_render.spectral.spectrum import Spectrum, merged_grid
 from hesim_render.targets.piece import Picture
 
@@ -61,7 +61,7 @@ class Texels:
     def __init__(
         self,
         mi: MitsubaModule,
-        pictures: Sequence[tuple[Picture, bool]],
+        pictures: Sequence[tuple[Picture | TextureData, bool]],
         irradiances: Sequence[Spectrum],
         responses: Sequence[Spectrum],
     ) -> None:
@@ -129,33 +129,34 @@ class Texels:
 
 
 def _factors(
-    mi: MitsubaModule, picture: Picture, irradiances: Sequence[Spectrum], responses: Sequence[Spectrum]
+    mi: MitsubaModule, picture: Picture | TextureData, irradiances: Sequence[Spectrum], responses: Sequence[Spectrum]
 ) -> NDArray[np.float32]:
     """Entries of the texels of a picture, [row, col, entry], the row with v = 0 first: the reflectance of a grey one,
     else the integrals of each light and filter, e⁻/s.
     """
+    from_below = picture.values if isinstance(picture, TextureData) else picture.values[::-1]
     if picture.kind == "grey":
-        return picture.values[::-1].astype(np.float32)
+        return from_below.astype(np.float32)
     pairs = [(level, response) for level in irradiances for response in responses]
-    if picture.wavelength_nm is not None:
+    if isinstance(picture, Picture) and picture.wavelength_nm is not None:
         knots = picture.wavelength_nm
         weights = np.stack([_weights(knots, *pair) for pair in pairs], axis=1)
-        return (picture.values[::-1] @ weights.astype(np.float32)).astype(np.float32)
+        return (from_below @ weights.astype(np.float32)).astype(np.float32)
     low, high = (each(end) for each, end in zip((min, max), _ends(pairs), strict=True))
     knots, fine = (np.linspace(low, high, ceil((high - low) / step) + 4) for step in (_STEP_NM, _FINE_NM))
     linear = np.stack([_weights(fine, *pair) for pair in pairs], axis=1)
     # values between the knots are those of a spline, which is linear in the values at the knots
     weights = CubicSpline(knots, np.eye(knots.size))(fine).T @ linear
-    flipped = picture.values[::-1]
-    height, width = flipped.shape[:2]
+    height, width = from_below.shape[:2]
     out = np.empty((height, width, len(pairs)), np.float32)
     at_once = max(1, _TEXELS_AT_ONCE // width)
     for begin in range(0, height, at_once):
-        rows = flipped[begin : begin + at_once]
-        # Mitsuba's own coefficients of its smooth spectra, as they are rendered; it doubles single rows and columns
-        texture = mi.load_dict(picture_texture(mi, replace(picture, values=rows[::-1])))
-        coefficients = np.array(mi.traverse(texture)["data"])[: len(rows), :width]
-        integrals = _integrals(mi, coefficients.reshape(-1, 3), knots, weights)
+        rows = from_below[begin : begin + at_once]
+        if isinstance(picture, Picture):
+            # Mitsuba's own coefficients of its smooth spectra, as they are rendered; it doubles single rows and columns
+            texture = mi.load_dict(picture_texture(mi, replace(picture, values=rows[::-1])))
+            rows = np.array(mi.traverse(texture)["data"])[: len(rows), :width]
+        integrals = _integrals(mi, rows.reshape(-1, 3), knots, weights)
         out[begin : begin + at_once] = integrals.reshape(len(rows), width, -1)
     dr.flush_malloc_cache()
     return out

@@ -1,0 +1,230 @@
+"""Scenes of Mitsuba whose light is seen in closed form, against Mitsuba's path tracer, and those that are not."""
+
+import numpy as np
+import pytest
+from PIL import Image
+from rendering import flux_image, mitsuba_scene, mono, pair_tracer, traced
+
+import hesim_render as hr
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.windows import Windows
+from hesim_render.sources.render.scene import surfaces
+from hesim_render.sources.render.scene.builder import build
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba, names_of
+
+#: Every kind of surface and light that has a closed form: a lamp that is mirrored and painted on both sides, spectra in
+#: tables of their own, a beam, a point, a sky, pictures in colour and grey, shapes without id or BSDF.
+SCENE = """<scene version="3.0.0">
+  <integrator type="path"><integer name="max_depth" value="2"/></integrator>
+  <bsdf type="plastic" id="spare"/>
+  <bsdf type="diffuse" id="clay"><rgb name="reflectance" value="0.61, 0.33, 0.2"/></bsdf>
+  <shape type="rectangle">
+    <transform name="to_world"><scale x="0.6" y="0.5"/><translate x="0.02" y="-0.03" z="-0.1"/></transform>
+    <bsdf type="diffuse"><texture type="checkerboard" name="reflectance">
+      <rgb name="color0" value="0.7, 0.65, 0.5"/>
+      <spectrum name="color1" value="420:0.05, 611:0.1, 612:0.95, 613:0.1, 690:0.4"/>
+      <transform name="to_uv"><scale x="7" y="-3"/></transform>
+    </texture></bsdf>
+  </shape>
+  <shape type="rectangle" id="board">
+    <transform name="to_world">
+      <scale x="0.17" y="0.12"/><rotate y="1" angle="25"/><translate x="-0.18" y="0.1" z="0.05"/>
+    </transform>
+    <bsdf type="twosided"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">
+      <string name="filename" value="colour.png"/><transform name="to_uv"><scale x="1.5" y="2"/></transform>
+    </texture></bsdf></bsdf>
+  </shape>
+  <shape type="rectangle" id="back-to-front">
+    <transform name="to_world"><scale x="0.1" y="0.12"/><rotate y="1" angle="200"/><translate x="0.22" y="0.15"/>
+    </transform>
+    <bsdf type="twosided"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">
+      <string name="filename" value="grey.png"/><string name="filter_type" value="nearest"/>
+      <string name="wrap_mode" value="clamp"/><transform name="to_uv"><scale x="1.3"/></transform>
+    </texture></bsdf></bsdf>
+  </shape>
+  <shape type="sphere"><point name="center" x="0.13" y="-0.12" z="0.05"/><float name="radius" value="0.09"/>
+    <ref id="clay"/></shape>
+  <shape type="cube" id="block">
+    <transform name="to_world">
+      <scale x="0.05" y="0.07" z="0.06"/><rotate z="1" angle="30"/><translate x="-0.15" y="-0.16" z="0.02"/>
+    </transform>
+  </shape>
+  <shape type="rectangle" id="lamp">
+    <transform name="to_world">
+      <scale x="-0.06" y="0.11"/><rotate x="1" angle="160"/><translate x="0.05" y="0.05" z="0.35"/>
+    </transform>
+    <bsdf type="twosided"><ref id="clay"/></bsdf>
+    <emitter type="area"><spectrum name="radiance" value="380:0.4, 500:2.1, 501:9, 502:2, 720:1.2"/></emitter>
+  </shape>
+  <shape type="rectangle" id="panel">
+    <transform name="to_world"><scale x="0.05" y="0.03"/><translate x="0.1" y="0.22" z="0.12"/></transform>
+    <emitter type="area"><rgb name="radiance" value="0.6, 0.9, 0.7"/></emitter>
+  </shape>
+  <emitter type="point"><point name="position" x="-0.4" y="0.3" z="0.7"/><rgb name="intensity" value="0.4, 0.5, 0.3"/>
+  </emitter>
+  <emitter type="constant"><spectrum name="radiance" value="0.13"/></emitter>
+  <emitter type="directional"><vector name="direction" x="0.3" y="0.2" z="-1"/>
+    <spectrum name="irradiance" value="0.35"/></emitter>
+</scene>"""
+
+
+def loaded(folder, text=SCENE, motion="[]", **extra):
+    """The scene, with a camera that looks at it from above."""
+    rng = np.random.default_rng(11)
+    for name, shape in (("colour.png", (6, 9, 3)), ("grey.png", (5, 4))):
+        Image.fromarray(rng.integers(20, 250, shape, dtype=np.uint8)).save(folder / name)
+    (folder / "scene.xml").write_text(text)
+    given = {"file": "scene.xml", "radiance_scale": 0.37, **extra}
+    (folder / "scene.yaml").write_text(
+        "schema_version: 1\nname: matt\ndescription: ''\n"
+        "camera: {origin_m: [0.03, 0.02, 2], target_m: [0.01, 0, 0], horizontal_fov_deg: 22.62}\n"
+        f"mitsuba: {given}\nmotion: {motion}\n"
+    )
+    return hr.load_scene(folder / "scene.yaml")
+
+
+def assert_same(tracer, scene, sensor, rays=4096):
+    """Means of 2×2 tiles by both estimates and Mitsuba's paths; differences over standard errors from halves."""
+
+    def groups(half_a, half_b):
+        shape = sensor.rows // 4, 2, 2, sensor.cols // 4, 2, 2
+        a, b = (np.array(half, np.float64).reshape(shape).mean(axis=(1, 4)) for half in (half_a, half_b))
+        return (a + b) / 2, (a - b) ** 2 / 4
+
+    a, b, _ = flux_image(scene, sensor, rays, begin_us=0.0, end_us=0.0)
+    wanted, their_square = groups(a, b)
+    assert wanted.std() > 0.2 * wanted.mean()
+    for controlled in (True, False):
+        seen = traced(tracer, rays, 0.0, 0.0, controlled)
+        got, square = groups(seen.half_a, seen.half_b)
+        spread = np.sqrt(np.mean(square + their_square))
+        assert spread < 0.01 * wanted.mean()
+        assert abs(np.mean(got - wanted)) < 5 * spread / got.size**0.5
+        assert np.abs(got - wanted).max() < 12 * spread
+
+
+def test_closed_form_sees_what_mitsubas_paths_see(tmp_path):
+    scene, sensor = loaded(tmp_path), hr.load_sensor("gen2").crop(60, 44, 1400, 1000)
+    tracer = pair_tracer(scene, sensor)
+    assert tracer.is_diffuse
+    assert_same(tracer, scene, sensor)
+
+
+def test_a_lamp_that_is_off_stays_as_a_painted_surface(tmp_path):
+    sensor, scene = hr.load_sensor("gen2").crop(60, 44, 1400, 1000), loaded(tmp_path, unlit=["lamp"])
+    tracer = pair_tracer(scene, sensor)
+    assert [light.kind for light in build(mitsuba(), scene.spec).matt.lights] == ["rectangle", "point", "beam", "sky"]
+    assert tracer.is_diffuse
+    assert_same(tracer, scene, sensor)
+
+
+def test_spectra_and_places_of_surfaces_and_lights_are_those_of_the_file(tmp_path):
+    mi = mitsuba()
+    built = build(mi, loaded(tmp_path).spec)
+    paints = {paint.shape: paint for paint in built.matt.paints}
+    assert names_of(built.scene.shapes()) == list(paints)
+    assert list(paints) == ["shape_0", "board", "back-to-front", "shape_3", "block", "lamp", "panel"]
+    floor = paints["shape_0"]
+    assert floor.scale == (7, -3) and not floor.two_sided and paints["board"].two_sided
+    nm = [400, 419.99, 420, 515.5, 611, 611.4, 612, 650, 690, 690.1]
+    assert floor.colours[1].at(nm) == pytest.approx(
+        [0, 0, 0.05, 0.075, 0.1, 0.44, 0.95, 0.1 + 0.3 * 37 / 77, 0.4, 0], abs=1e-5
+    )
+    assert paints["block"].colours[0].at([400, 700]) == pytest.approx(0.5)
+    lamp, panel, point, beam, sky = built.matt.lights
+    assert lamp.shape == "lamp" and panel.shape == "panel" and point.shape is None
+    assert lamp.strength.at([380, 500.5, 501, 501.5]) == pytest.approx([0.4, 5.55, 9, 5.5], rel=1e-5)
+    turned = np.radians(160)
+    assert lamp.place[:3, 2] == pytest.approx([0, -np.sin(turned), np.cos(turned)], abs=1e-6)
+    assert np.abs(lamp.place[:3, 0]) == pytest.approx([0.06, 0, 0], abs=1e-7)
+    assert np.linalg.norm(lamp.place[:3, 1]) == pytest.approx(0.11)
+    assert lamp.place[:3, 3] == pytest.approx([0.05, 0.05, 0.35])
+    for each in (lamp, panel):  # corners run anticlockwise for who sees it shine
+        assert np.cross(each.place[:3, 0], each.place[:3, 1]) @ each.place[:3, 2] > 0
+    assert point.place == pytest.approx([-0.4, 0.3, 0.7])
+    assert beam.place == pytest.approx(np.array([0.3, 0.2, -1]) / np.linalg.norm([0.3, 0.2, -1]))
+    assert beam.strength.at([400, 700]) == pytest.approx(0.35) and sky.strength.at([420, 550]) == pytest.approx(0.13)
+    assert sky.level.at(550) == pytest.approx(0.13 * np.pi)  # of a plane
+
+
+RED = '<rgb name="reflectance" value="0.61, 0.33, 0.2"/>'
+EVEN = '<rgb name="intensity" value="0.4, 0.5, 0.3"/>'
+BITMAP = '<texture type="bitmap" name="{}"><string name="filename" value="colour.png"/>{}</texture>'
+
+
+@pytest.mark.parametrize(
+    "old, new",
+    [
+        ('name="max_depth" value="2"', 'name="max_depth" value="3"'),
+        ('<ref id="clay"/></shape>', '<ref id="spare"/></shape>'),
+        (f'<bsdf type="diffuse" id="clay">{RED}</bsdf>', '<bsdf type="plastic" id="clay"/>'),
+        ('<ref id="clay"/></bsdf>', '<ref id="clay"/><ref id="spare"/></bsdf>'),
+        ('<ref id="clay"/></shape>', '<ref id="clay"/><emitter type="area"/></shape>'),
+        ('<scale x="-0.06" y="0.11"/>', '<scale x="-0.06" y="0.11"/><rotate z="1" angle="20"/><scale x="2"/>'),
+        ('<rgb name="radiance" value="0.6, 0.9, 0.7"/>', BITMAP.format("radiance", "")),
+        ('<scale x="1.5" y="2"/>', '<scale x="1.5" y="2"/><rotate z="1" angle="10"/>'),
+        ('<scale x="1.3"/>', '<scale x="1.3"/><translate x="0.2"/>'),
+        ('value="clamp"', 'value="mirror"'),
+        ('<shape type="cube" id="block">', '<shape type="merge"><shape type="cube"/></shape><shape type="cube">'),
+        ('value="clamp"/>', 'value="clamp"/><boolean name="raw" value="true"/>|grey.png|colour.png'),
+        ('<emitter type="point">', '<emitter type="point"><float name="sampling_weight" value="0"/>'),
+        ('<emitter type="point"><point name="position" x="-0.4" y="0.3" z="0.7"/>', '<emitter type="spot">'),
+        ('<rgb name="color0" value="0.7, 0.65, 0.5"/>', BITMAP.format("color0", "")),
+        (RED, BITMAP.format("reflectance", '<transform name="to_uv"><scale x="0"/></transform>')),
+        (RED, '<texture type="mesh_attribute" name="reflectance"><string name="name" value="vertex_a"/></texture>'),
+    ],
+)  # fmt: skip
+def test_what_has_no_closed_form_is_seen_by_paths(tmp_path, old, new):
+    """One thing is changed in each case. (|old|new is a second one.)"""
+    new, *second = new.split("|")
+    text = SCENE.replace(old, new)
+    text = text.replace(*second) if second else text
+    assert text != SCENE
+    scene = loaded(tmp_path, text)
+    assert build(mitsuba(), scene.spec).matt is None
+    assert not pair_tracer(scene, mono(8, 6)).is_diffuse
+
+
+def test_surfaces_that_were_made_before_are_seen_by_paths():
+    """The parser says nothing of them."""
+    mi, shapes = mitsuba(), {"wall": {"type": "rectangle"}, "light": {"type": "constant"}}
+    assert build(mi, mitsuba_scene(shapes, depth=2).spec).matt is not None
+    shapes["wall"]["bsdf"] = mi.load_dict({"type": "plastic"})
+    assert build(mi, mitsuba_scene(shapes, depth=2).spec).matt is None
+
+
+def test_a_direct_integrator_has_depth_2(tmp_path):
+    own = '<integrator type="path"><integer name="max_depth" value="2"/></integrator>'
+    for text in (
+        SCENE.replace(own, '<integrator type="direct"/>'),
+        SCENE.replace('value="2"/></int', 'value="8"/></int'),
+    ):
+        scene = loaded(tmp_path, text)
+        assert (build(mitsuba(), scene.spec).matt is None) == ('"8"' in text)
+    assert build(mitsuba(), hr.load_scene(tmp_path / "scene.yaml", {"max_depth": 2}).spec).matt is not None
+
+
+def test_moving_shapes_have_the_wanted_error_in_the_default_mode(tmp_path, monkeypatch):
+    """A board with a picture slides and turns, and its shadows with it; errors in noise units against paths."""
+    turn = "{t_us: 100000, translation_m: [0.2, 0.05, 0], rotation_axis: [0, 0, 1], rotation_deg: 40}"
+    motion = f"[{{object: board, keyframes: [{{t_us: 0}}, {turn}]}}]"
+    scene, sensor = loaded(tmp_path, motion=motion), hr.load_sensor("davis346").crop(48, 36, 150, 110)
+    flux = ChangeDrivenFlux(scene, sensor, 0.5, seed=6)
+    blocks = list(flux.sample_blocks(1, 0, 5_000))
+    pixels = np.arange(48 * 36, dtype=np.uint32)
+    seen = np.array([(np.array(s.half_a) + np.array(s.half_b)) / 2 for s in flux.flux_of_blocks(pixels, blocks)])
+    begin, end = (np.concatenate([getattr(b, name)[b.wanted] for b in blocks]) for name in ("begin_us", "end_us"))
+    unit = flux.noise_unit(pixels, seen, True)
+    changes = np.abs(seen - seen[0]) > 3 * unit
+    window, pixel = (index[np.random.default_rng(2).permutation(changes.sum())[:500]] for index in np.nonzero(changes))
+    monkeypatch.setattr(surfaces, "_MOST_ENTRIES", 0)
+    paths = pair_tracer(scene, sensor)
+    assert flux._renderer.tracer.is_diffuse and not paths.is_diffuse
+    places, windows = sensor.layout.full_index.ravel()[pixel], Windows(begin, end)
+    given = places, window, windows, np.full(pixel.size, 4096), np.zeros(pixel.size, np.bool_)
+    several = np.array([paths.trace(*given, repeat=k).mean for k in range(4)], np.float64)
+    off = (seen[window, pixel] - several.mean(axis=0)) / unit[window, pixel]
+    assert pixel.size == 500
+    assert np.sqrt(np.mean(several.var(axis=0, ddof=1) / 4 / unit[window, pixel] ** 2)) < 0.2
+    assert np.sqrt(np.mean(off**2)) < 0.55
+    assert abs(off.mean()) < 4.4 * off.std() / off.size**0.5
