@@ -11,7 +11,7 @@ from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.transport import outlines
-from hesim_render.sources.render.transport.outlines import Outline, Screen, largest, outlines_of
+from hesim_render.sources.render.transport.outlines import Ball, Outline, Screen, largest, outlines_of
 
 #: A skew quadrilateral in a tilted plane.
 QUAD = np.array([[-0.7, -0.2, 0.1], [0.5, -0.4, 0.3], [0.9, 0.6, 0.52], [-0.3, 0.8, 0.28]])
@@ -63,6 +63,42 @@ def test_the_share_is_that_of_rays(point, normal):
     expected = meets_polygon(QUAD, point, along)
     assert np.mean(count != expected) < 2e-4  # rounding at edges
     assert share[0] == pytest.approx(expected.mean(), abs=float(4 * np.sqrt(share[0] * (1 - share[0]) / 60_000) + 1e-5))
+
+
+@pytest.mark.parametrize("height", [0.97, 0.55, 0.32, -0.02, -0.25, -0.44, -0.9])
+@pytest.mark.parametrize("radius_m", [0.3, 0.033])
+def test_the_share_of_a_ball_is_that_of_rays(height, radius_m):
+    """At various heights over the horizon, as cosines; the larger ball has an angular radius of 27 degrees."""
+    along_middle, point = np.array([0.3, -0.5, 0.3]), np.array([0.2, 0.1, -0.3])
+    towards = along_middle / np.linalg.norm(along_middle)
+    across = np.cross(towards, [0.6, 0.1, 0.2])
+    normal = height * towards + np.sqrt(1 - height**2) * across / np.linalg.norm(across)
+    along = directions(normal, 100_000, np.random.default_rng(8))
+    ball = Ball(point + along_middle, radius_m)
+    share, count = hides([ball], np.tile(point, (100_000, 1)), np.tile(normal, (100_000, 1)), along)
+    nearest = along @ along_middle
+    expected = (nearest > 0) & (along_middle @ along_middle - nearest**2 < radius_m**2)
+    assert np.mean(count != expected) < 2e-4
+    square = radius_m**2 / (along_middle @ along_middle)
+    assert share[0] == pytest.approx(expected.mean(), abs=float(4 * np.sqrt(share[0] * (1 - share[0]) / 1e5) + 3e-6))
+    if height > np.sqrt(square):
+        assert share[0] == pytest.approx(height * square, rel=1e-4, abs=1e-6)
+    assert (share[0] > 1e-6) == (height > -np.sqrt(square))
+
+
+def test_a_ball_hides_nothing_from_itself_and_most_from_where_it_touches():
+    ball, up = Ball(np.array([0.1, 0.2, 0.5]), 0.2), np.array([[0.0, 0.0, 1.0]] * 4)
+    out = np.array([0.3, 0.6, 0.742])
+    own = [
+        ball.middle + 0.2 * out / np.linalg.norm(out),
+        ball.middle + np.array([0.05, 0.02, 0.1]),
+        ball.middle - np.array([0, 0, 0.2]),
+    ]
+    points = np.array([*own, ball.middle - np.array([0, 0, 0.21])])
+    share, count = hides([ball], points, up, up)
+    np.testing.assert_array_equal(share[:3], 0)
+    np.testing.assert_array_equal(count, [0, 0, 0, 1])
+    assert share[3] == pytest.approx((0.2 / 0.21) ** 2, rel=1e-4)
 
 
 def test_a_closed_body_hides_its_silhouette_once():
@@ -125,7 +161,12 @@ def test_only_flat_and_filled_shapes_have_an_outline():
     assert outlines_of(mesh(corners, faces[2:])) == []
     # its corners the other way round: from outside, every face is a back
     assert outlines_of(mesh(corners, faces[:, ::-1])) == []
-    assert outlines_of(mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})) == []
+    ball = {"type": "sphere", "center": [0.2, -0.1, 0.4], "radius": 0.3}
+    (known,) = outlines_of(mi.load_dict({"type": "scene", "ball": ball}))
+    assert known.middle == pytest.approx([0.2, -0.1, 0.4]) and known.radius_m == pytest.approx(0.3)
+    # of a part with other forms, its balls
+    among = {"type": "scene", "ball": ball, "plate": {"type": "rectangle"}, "tube": {"type": "cylinder"}}
+    assert [type(each) for each in outlines_of(mi.load_dict(among))] == [Ball]
 
 
 def test_the_largest_outlines_count():

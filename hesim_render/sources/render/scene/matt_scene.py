@@ -16,7 +16,7 @@ from hesim_render.core.device import dr
 from hesim_render.core.device_types import Bands, Interaction, MitsubaModule, MitsubaObject
 from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.direct_lights import DirectLight
-from hesim_render.sources.render.scene.mitsuba_version import names_of
+from hesim_render.sources.render.scene.mitsuba_version import names_of, rectangle_frame
 from hesim_render.sources.render.scene.parsed_scene import children_of
 from hesim_render.sources.render.scene.pictures import TextureData
 from hesim_render.sources.render.scene.surfaces import Paint
@@ -251,13 +251,11 @@ class _Reader:
 
     def frame(self, shape: MitsubaObject) -> NDArray[np.float64] | None:
         """The frame of a rectangle, see `area_light_frame`; None if it has no right angles."""
-        mi = self._mi
-        matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4, -1)[:, :, 0]
-        width, height = matrix[:3, 0], matrix[:3, 1]
+        mi, frame = self._mi, rectangle_frame(shape)
+        width, height = frame[:3, 0].copy(), frame[:3, 1]
         if abs(width @ height) > _RIGHT_ANGLED * np.linalg.norm(width) * np.linalg.norm(height):
             return None
         normal = np.array(shape.sample_position(0.0, mi.Point2f(0.5)).n, np.float64).ravel()
-        frame = matrix.copy()
         # corners run anticlockwise for who sees it shine
         frame[:3, 0] = width if np.cross(width, height) @ normal > 0 else -width
         frame[:3, 2] = normal

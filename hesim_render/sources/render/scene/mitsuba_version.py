@@ -158,6 +158,14 @@ def mesh_faces(mesh: MitsubaObject) -> NDArray[np.int64]:
     return np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
 
 
+def rectangle_frame(shape: MitsubaObject) -> NDArray[np.float64]:
+    """Placement [4, 4] of a rectangle of Mitsuba, whose corners are at -1 and 1 along x and y."""
+    import mitsuba as mi
+
+    matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64)
+    return matrix.reshape(4, 4, -1)[:, :, 0]
+
+
 def can_move(parameters: MitsubaObject, prefix: str) -> bool:
     """Whether a shape of a loaded scene has a pose that can be set."""
     return f"{prefix}.vertex_positions" in parameters or f"{prefix}.to_world" in parameters

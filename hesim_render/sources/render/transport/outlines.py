@@ -27,6 +27,8 @@ _MOST = 8
 _MOST_CORNERS, _MOST_SHAPES, _MOST_TRIANGLES = 8, 64, 100_000
 #: Distance from a plane, over the size of what lies in it, up to which a point lies in the plane.
 _IN_PLANE = 1e-5
+#: Squared distance from the middle of a ball, over its squared radius, up to which a point is one of its surface.
+_BESIDE_BALL = 1.0001
 #: Least part of an outline that the surface must fill.
 _FILLED = 0.98
 
@@ -56,20 +58,45 @@ class Outline:
         return 0.5 * float(np.linalg.norm(_twice_area(self.corners)))
 
 
-def outlines_of(scene: MitsubaObject) -> list[Outline]:
+@dataclass(frozen=True)
+class Ball:
+    """A ball, which hides a circle of directions.
+
+    Parameters
+    ----------
+    middle : [3], m.
+    radius_m : its radius.
+    """
+
+    middle: NDArray[np.float64]
+    radius_m: float
+
+    @property
+    def area_m2(self) -> float:
+        return pi * self.radius_m**2
+
+
+def outlines_of(scene: MitsubaObject) -> list[Outline | Ball]:
     """Outlines of the shapes of a part: of all of them together, if they lie in one plane and fill their hull; else of
-    each mesh that is flat, or closed and convex with few faces.
+    each one that is flat, a ball, or closed and convex with few faces.
     """
     shapes = scene.shapes()
-    if not shapes or len(shapes) > _MOST_SHAPES or not all(shape.is_mesh() for shape in shapes):
+    if len(shapes) > _MOST_SHAPES:
         return []
-    if sum(shape.face_count() for shape in shapes) > _MOST_TRIANGLES:
+    if not all(shape.is_mesh() for shape in shapes):
+        return [_ball(shape) for shape in shapes if shape.class_name() == "Sphere"]
+    if not shapes or sum(shape.face_count() for shape in shapes) > _MOST_TRIANGLES:
         return []
     triangles = [mesh_vertices(shape)[mesh_faces(shape)] for shape in shapes]
     together = _flat(np.concatenate(triangles))
     if together is not None:
         return [together]
     return [outline for each in triangles for outline in _of_mesh(each)]
+
+
+def _ball(shape: MitsubaObject) -> Ball:
+    low, high = (np.array(corner, np.float64).ravel() for corner in (shape.bbox().min, shape.bbox().max))
+    return Ball((low + high) / 2, float(np.mean(high - low)) / 2)
 
 
 def _of_mesh(triangles: NDArray[np.float64]) -> list[Outline]:
@@ -153,15 +180,20 @@ class Screen:
     outlines : one or more.
     """
 
-    def __init__(self, mi: MitsubaModule, outlines: Sequence[Outline]) -> None:
+    def __init__(self, mi: MitsubaModule, outlines: Sequence[Outline | Ball]) -> None:
         self._mi = mi
-        self._sides = [each.one_sided for each in outlines]
-        self._corners = [[mi.Point3f(corner) for corner in each.corners] for each in outlines]
+        flat = [each for each in outlines if isinstance(each, Outline)]
+        self._sides = [each.one_sided for each in flat]
+        self._corners = [[mi.Point3f(corner) for corner in each.corners] for each in flat]
         self._planes = [
             (mi.Vector3f(each.normal), mi.Float(float(each.normal @ each.corners[0])), mi.Float(_margin(each)))
-            for each in outlines
+            for each in flat
         ]
-        dr.make_opaque(self._corners, self._planes)
+        #: Centre and squared radius of each ball.
+        self._balls = [
+            (mi.Point3f(each.middle), mi.Float(each.radius_m**2)) for each in outlines if isinstance(each, Ball)
+        ]
+        dr.make_opaque(self._corners, self._planes, self._balls)
 
     def hides(self, point: Point3, normal: Vector3, direction: Vector3) -> tuple[Float, Float]:
         """Share of a uniform sky that the outlines hide from surface points, and how many outlines hide a direction.
@@ -204,14 +236,57 @@ class Screen:
                 label="outline",
             )
             share, count = share + part, count + hides
+        for middle, square in self._balls:
+            to = middle - point
+            distance = dr.squared_norm(to)
+            # a point on or in the ball is one of its own surface
+            counts = distance > square * _BESIDE_BALL
+
+            def behind(to: Vector3, normal: Vector3, direction: Vector3, part: Float) -> tuple[Float, Float]:
+                return _hidden_by_ball(mi, dr.normalize(to), part, normal, direction)
+
+            part, hides = dr.if_stmt(
+                (to, normal, direction, square / distance),
+                counts & (dr.dot(to, normal) > -dr.sqrt(square)),
+                behind,
+                lambda *_: (mi.Float(0.0), mi.Float(0.0)),
+                label="ball",
+            )
+            share, count = share + part, count + hides
         return share, count
+
+
+def _hidden_by_ball(
+    mi: MitsubaModule, towards: Vector3, square: Float, normal: Vector3, direction: Vector3
+) -> tuple[Float, Float]:
+    """Share of a uniform sky that a ball hides, and 1 where it hides a direction.
+
+    Half the integral of r × dr along the rim of what is seen of the ball above the horizon, times the normal: an arc
+    of the circle, and, where the ball reaches below, of the horizon.
+
+    Parameters
+    ----------
+    towards : unit vector to the middle of the ball.
+    square : squared sine of its angular radius, below 1.
+    normal, direction : see `Screen.hides`.
+    """
+    sine, cosine = dr.sqrt(square), dr.sqrt(1 - square)
+    height = dr.clip(dr.dot(towards, normal), -1, 1)
+    across = dr.sqrt(dr.maximum(1 - height * height, 0))
+    # half the arc above the horizon; a ball that does not reach it counts with its whole circle
+    turn = -cosine * height / dr.maximum(sine * across, 1e-20)
+    half = dr.acos(dr.clip(turn, -1, 1))
+    arc = half * square * height - cosine * sine * across * dr.sin(half)
+    level = dr.atan2(sine * dr.sin(half), cosine * across - sine * height * dr.cos(half))
+    hides = dr.dot(direction, towards) > cosine
+    return dr.maximum(arc + level, 0) / pi, dr.select(hides, mi.Float(1.0), 0.0)
 
 
 def _margin(outline: Outline) -> float:
     return _IN_PLANE * float(np.linalg.norm(np.ptp(outline.corners, axis=0)))
 
 
-def largest(parts: Sequence[Sequence[Outline]]) -> list[list[Outline]]:
+def largest(parts: Sequence[Sequence[Outline | Ball]]) -> list[list[Outline | Ball]]:
     """The largest outlines of several parts, at most `_MOST` in all; of equal ones the first."""
     every = [(number, outline) for number, part in enumerate(parts) for outline in part]
     kept = sorted(every, key=lambda one: -one[1].area_m2)[:_MOST]
