@@ -11,7 +11,7 @@ from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene import lights
 from hesim_render.sources.render.scene.deformation import Deformation
-from hesim_render.sources.render.scene.direct_lights import direct_lights
+from hesim_render.sources.render.scene.direct_lights import DirectLight, direct_lights
 from hesim_render.sources.render.scene.matt_scene import MattScene
 from hesim_render.sources.render.scene.mesh_file import mesh_shapes
 from hesim_render.sources.render.scene.mitsuba_scene import MitsubaCamera, load_mitsuba, path_tracer
@@ -211,13 +211,14 @@ def _describe(
     mi: MitsubaModule, spec: SceneSpec
 ) -> tuple[dict[str, Any], dict[str, list[str]], MattScene | None, dict[str, Deformation]]:
     """Mitsuba's dictionary of a scene file, the shape ids of each movable name, surfaces and lights (None if a shape
-    shines or is not diffuse), and the objects that change their shape.
+    is not diffuse, or shines and has no closed form), and the objects that change their shape.
     """
     deformations: dict[str, Deformation] = {}
     all_diffuse = True
     content: dict[str, Any] = {}
     groups: dict[str, list[str]] = {}
     paints: list[Paint] = []
+    shining: list[DirectLight] = []
     if spec.target is not None:
         groups["target"] = []
         for number, piece in enumerate(target_pieces(spec)):
@@ -243,8 +244,10 @@ def _describe(
             parts = {name: _object(mi, item, name, placement, bsdf)}
         content.update(parts)
         groups[item.name] = list(parts)
-        if is_diffuse(item):
+        light = _shining(item, name, placement)
+        if is_diffuse(item) and (light is not None or radiance_of(item) is None):
             paints += [paint_of(item, part, picture) for part in parts]
+            shining += [] if light is None else [light]
         else:
             all_diffuse = False
     try:
@@ -252,7 +255,7 @@ def _describe(
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
     has_map = any(light.type == "environment" for light in spec.lights)
-    matt = MattScene(paints, direct_lights(spec.lights)) if all_diffuse and not has_map else None
+    matt = MattScene(paints, direct_lights(spec.lights, shining)) if all_diffuse and not has_map else None
     return content, groups, matt, deformations
 
 
@@ -278,6 +281,16 @@ def _placement(item: ObjectSpec) -> NDArray[np.float64]:
     placement[:3, :3] = rotation_about(item.rotation_axis, item.rotation_deg)
     placement[:3, 3] = item.position_m
     return placement
+
+
+def _shining(item: ObjectSpec, name: str, placement: NDArray[np.float64]) -> DirectLight | None:
+    """The light of an object that shines, if it has a closed form; `name` is that of its shape."""
+    radiance, half = radiance_of(item), np.array(item.size_m) / 2
+    if radiance is None or item.shape not in ("rectangle", "sphere"):
+        return None
+    if item.shape == "sphere":
+        return DirectLight("ball", radiance, 1.0, np.array([*placement[:3, 3], half[0]]), name)
+    return DirectLight("rectangle", radiance, 1.0, placement @ np.diag([half[0], half[1], 1.0, 1.0]), name)
 
 
 def _object(mi: MitsubaModule, item: ObjectSpec, name: str, placement: NDArray[np.float64], bsdf: Any) -> MitsubaObject:

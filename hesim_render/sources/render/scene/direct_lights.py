@@ -19,16 +19,17 @@ class DirectLight:
 
     Parameters
     ----------
-    kind : ``rectangle``: one-sided and Lambertian; ``point``; ``beam``: parallel light; ``sky``: the same from all
-        directions.
+    kind : ``rectangle``: one-sided and Lambertian; ``ball``: Lambertian; ``point``; ``beam``: parallel light; ``sky``:
+        the same from all directions.
     level : irradiance on the light's plane, W m⁻² nm⁻¹.
-    geometry : that of a light of unit strength: radiance of a rectangle or sky, intensity of a point, irradiance across
-        a beam.
-    place : of a rectangle [4, 4], see `area_light_frame`; position of a point, m, and direction of a beam, [3].
+    geometry : that of a light of unit strength: radiance of a rectangle, ball or sky, intensity of a point, irradiance
+        across a beam. Without a plane it is 1.
+    place : of a rectangle [4, 4], see `area_light_frame`; middle and radius of a ball, [4], m; position of a point, m,
+        and direction of a beam, [3].
     shape : name in the Mitsuba scene of the shape that shines; None of others.
     """
 
-    kind: Literal["rectangle", "point", "beam", "sky"]
+    kind: Literal["rectangle", "ball", "point", "beam", "sky"]
     level: Spectrum
     geometry: float
     place: NDArray[np.float64]
@@ -40,8 +41,8 @@ class DirectLight:
         return self.level.scaled(1 / self.geometry)
 
 
-def direct_lights(given: Sequence[LightSpec]) -> list[DirectLight]:
-    """Lights of a scene file that are on; all uniform ones are one sky, which comes last.
+def direct_lights(given: Sequence[LightSpec], shining: Sequence[DirectLight] = ()) -> list[DirectLight]:
+    """Lights of a scene file that are on, and objects that shine; all uniform lights are one sky, which comes last.
 
     Raises
     ------
@@ -65,6 +66,7 @@ def direct_lights(given: Sequence[LightSpec]) -> list[DirectLight]:
             result.append(DirectLight("point", level, geometry, np.array(light.position_m, np.float64)))
         else:
             result.append(DirectLight("beam", level, geometry, lights.beam_direction(light)))
+    result += shining
     if skies:
         result.append(DirectLight("sky", summed(*skies) if len(skies) > 1 else skies[0], pi, np.empty(0)))
     return result

@@ -16,7 +16,7 @@ from hesim_render.core.device import dr
 from hesim_render.core.device_types import Bands, Interaction, MitsubaModule, MitsubaObject
 from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.direct_lights import DirectLight
-from hesim_render.sources.render.scene.mitsuba_version import names_of, rectangle_frame
+from hesim_render.sources.render.scene.mitsuba_version import ball_of, names_of, rectangle_frame
 from hesim_render.sources.render.scene.parsed_scene import children_of
 from hesim_render.sources.render.scene.pictures import TextureData
 from hesim_render.sources.render.scene.surfaces import Paint
@@ -116,7 +116,7 @@ def _parsed_paint(nodes: Sequence[Any], node: Any) -> ParsedPaint | None:
     lamps, bsdfs = ([child for child in children if child.type.name == kind] for kind in ("Emitter", "BSDF"))
     if node.props.plugin_name() not in _PLAIN_SHAPES or max(len(lamps), len(bsdfs)) > 1:
         return None
-    if lamps and not (node.props.plugin_name() == "rectangle" and _is_even_light(nodes, lamps[0])):
+    if lamps and not (_is_lamp(node) and _is_even_light(nodes, lamps[0])):
         return None
     own: dict[str, Any] = {"name": node.props.id(), "shines": bool(lamps), "two_sided": False}
     if not bsdfs:
@@ -146,6 +146,12 @@ def _parsed_paint(nodes: Sequence[Any], node: Any) -> ParsedPaint | None:
     return ParsedPaint(
         **own, texture="picture", interpolation=interpolation or "bilinear", repeats=wrap in ("", "repeat")
     )
+
+
+def _is_lamp(node: Any) -> bool:
+    """True if the light of a shape that shines has a closed form: a ball must shine outwards."""
+    name = node.props.plugin_name()
+    return name == "rectangle" or (name == "sphere" and not node.props.get("flip_normals", False))
 
 
 def _is_even_light(nodes: Sequence[Any], node: Any) -> bool:
@@ -197,10 +203,12 @@ def loaded_matt_scene(mi: MitsubaModule, scene: MitsubaObject, parsed: ParsedMat
         scale, repeats = paint.scale, picture is not None and paint.repeats
         result.paints.append(Paint(name, colours, scale, paint.two_sided, picture, repeats))
         if paint.shines:
-            frame = reader.frame(shape)
-            if frame is None:
+            is_ball = shape.class_name() == "Sphere"
+            place = ball_of(shape) if is_ball else reader.frame(shape)
+            if place is None:
                 return None
-            result.lights.append(DirectLight("rectangle", reader.radiance(shape), 1.0, frame, name))
+            own = reader.radiance(shape), 1.0, place, name
+            result.lights.append(DirectLight("ball", *own) if is_ball else DirectLight("rectangle", *own))
     # a sky comes last
     for kind, light in sorted(zip(parsed.lights, lights, strict=True), key=lambda pair: pair[0] == "sky"):
         result.lights.append(reader.light(kind, light))

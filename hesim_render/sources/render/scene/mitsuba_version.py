@@ -158,6 +158,12 @@ def mesh_faces(mesh: MitsubaObject) -> NDArray[np.int64]:
     return np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
 
 
+def ball_of(shape: MitsubaObject) -> NDArray[np.float64]:
+    """Middle and radius of a sphere of Mitsuba, [4]."""
+    low, high = (np.array(corner, np.float64).ravel() for corner in (shape.bbox().min, shape.bbox().max))
+    return np.array([*(low + high) / 2, np.mean(high - low) / 2])
+
+
 def rectangle_frame(shape: MitsubaObject) -> NDArray[np.float64]:
     """Placement [4, 4] of a rectangle of Mitsuba, whose corners are at -1 and 1 along x and y."""
     import mitsuba as mi

@@ -50,8 +50,8 @@ class Paint:
 
 
 def is_diffuse(item: ObjectSpec) -> bool:
-    """True if an object is diffuse, of one or two colours or with a picture, and does not shine."""
-    return item.material is None and item.emission is None and item.materials == "own"
+    """True if an object is diffuse, of one or two colours or with a picture."""
+    return item.material is None and item.materials == "own"
 
 
 def reflects_diffusely(mi: MitsubaModule, bsdf: MitsubaObject | None) -> bool:

@@ -19,7 +19,7 @@ A path tracer with multiple importance sampling [veach1997] estimates the produc
 dark side of a penumbra its error was three times as large, with more rays.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import pi
 
 import numpy as np
@@ -27,19 +27,15 @@ import numpy as np
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import (
     Float,
-    Interaction,
     Mask,
     MitsubaObject,
     Ray,
     UInt32,
-    Vector3,
 )
 from hesim_render.core.host_arrays import from_host
-from hesim_render.sources.render.scene.direct_lights import DirectLight
 from hesim_render.sources.render.scene.matt_scene import MattScene
 from hesim_render.sources.render.scene.pictures import TextureData
-from hesim_render.sources.render.transport.irradiance import RectangleLight
-from hesim_render.sources.render.transport.leaving import Leaving
+from hesim_render.sources.render.transport.light_sources import RectangleLamp, Sky, light_source
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.occluded_lamps import SLOTS, LampShadows
 from hesim_render.sources.render.transport.outlines import OccludedSky
@@ -68,16 +64,14 @@ class DiffuseIntegrator:
     def __init__(self, scene: MovingScene, matt: MattScene, responses: Mapping[str, Spectrum]) -> None:
         self._scene = scene
         #: Objects that compute e_k and draw a point, in the order of the scene's lights.
-        self._lights: list[_Lamp | _Beam | _Point | _Sky] = [
-            _SEEN_AS[light.kind](scene.leaving, light) for light in matt.lights
-        ]
+        self._lights = [light_source(scene.leaving, light) for light in matt.lights]
         irradiances = [light.level for light in matt.lights]
         # a ray that hits the light itself carries its strength
         strengths = [light.strength for light in matt.lights]
         lamp_of = {light.shape: number for number, light in enumerate(matt.lights) if light.shape is not None}
         self._has_sky = bool(matt.lights) and matt.lights[-1].kind == "sky"
         self._outlines = OccludedSky(scene) if self._has_sky else None
-        self._shadows = LampShadows(scene) if lamp_of else None
+        self._shadows = LampShadows(scene) if any(light.kind == "rectangle" for light in matt.lights) else None
         black = constant(0.0)
         colours: list[Spectrum] = [black]
         rows: dict[str, list[float]] = {}
@@ -198,13 +192,13 @@ class DiffuseIntegrator:
             if self._texels is not None and texel is not None:
                 scale = self._texels.factor(texel, number * self._filters + filter_index, scale, asks)
             known = open_
-            if shadows is not None and self._shadows is not None and isinstance(light, _Lamp):
+            if shadows is not None and self._shadows is not None and isinstance(light, RectangleLamp):
                 of = normal, shadow, moment, dr.select(asks, shadows, 0)
                 part, hits = self._shadows.before(light.rectangle, *of)
                 known = dr.fma(share, hits, open_ - part * light.scale)
                 # where two shapes hide the same, a ray may bring more than is known to arrive
                 open_ = dr.select(shadows < 256, open_ - part * light.scale, open_)
-            if self._outlines is not None and self._outlines.is_known and isinstance(light, _Sky):
+            if self._outlines is not None and self._outlines.is_known and isinstance(light, Sky):
                 # a share of the sky that is known to be hidden, and whether it hides this ray
                 part, hides = self._outlines.hides(surface.world.p, normal, shadow.d, moment)
                 known = open_ - part + hides
@@ -240,76 +234,8 @@ class DiffuseIntegrator:
         normal = mi.Vector3f(surface.world.n)
         normal = dr.select(dr.dot(normal, ray.d) < 0, normal, -normal)
         code = mi.UInt32(0)
-        lamps = [light for light in self._lights if isinstance(light, _Lamp)]
+        lamps = [light for light in self._lights if isinstance(light, RectangleLamp)]
         for number, lamp in enumerate(lamps[:SLOTS]):
             open_, _, shadow = lamp.seen_from(surface.world, normal, sampler)
             code |= self._shadows.first_met(shadow, moment, hit & (open_ > 0)) << (8 * number)
         return code
-
-
-class _Lamp:
-    """A rectangle light; its strength is its radiance."""
-
-    def __init__(self, leaving: Leaving, light: DirectLight) -> None:
-        self.rectangle, self._leaving = RectangleLight(leaving.mi, light.place), leaving
-        self.scale = dr.opaque(leaving.mi.Float, 1 / light.geometry)
-
-    def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
-        """e_k and r at surface points, and the shadow ray to the point drawn on the light.
-
-        Parameters
-        ----------
-        point : Interaction3f, world space.
-        normal : unit Vector3f, on the visible side.
-        sampler : random numbers.
-        """
-        drawn, share = self.rectangle.sample(point.p, normal, sampler.surface_2d())
-        shadow = self._leaving.to(point, drawn)
-        return self.rectangle.irradiance(point.p, normal) * self.scale, share * self.scale, shadow
-
-
-class _Point:
-    """A point light; its strength is its intensity."""
-
-    def __init__(self, leaving: Leaving, light: DirectLight) -> None:
-        mi, self._leaving = leaving.mi, leaving
-        self._position, self._scale = mi.Point3f(light.place), dr.opaque(mi.Float, 1 / light.geometry)
-        dr.make_opaque(self._position)
-
-    def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
-        """See `_Lamp.seen_from`."""
-        to = self._position - point.p
-        square = dr.squared_norm(to)
-        level = dr.maximum(dr.dot(to, normal), 0.0) * dr.rsqrt(square) / square * self._scale
-        return level, level, self._leaving.to(point, self._position)
-
-
-class _Beam:
-    """Parallel light; its strength is the irradiance across the beam."""
-
-    def __init__(self, leaving: Leaving, light: DirectLight) -> None:
-        mi, self._leaving = leaving.mi, leaving
-        self._towards, self._scale = mi.Vector3f(-light.place), dr.opaque(mi.Float, 1 / light.geometry)
-        dr.make_opaque(self._towards)
-
-    def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
-        """See `_Lamp.seen_from`."""
-        level = dr.maximum(dr.dot(self._towards, normal), 0.0) * self._scale
-        return level, level, self._leaving.along(point, self._towards)
-
-
-class _Sky:
-    """Uniform light from all directions; its strength is its radiance, and e_k is 1."""
-
-    def __init__(self, leaving: Leaving, light: DirectLight) -> None:
-        self._leaving = leaving
-
-    def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
-        """See `_Lamp.seen_from`. Directions have a cosine distribution, so r is 1 as well."""
-        mi = self._leaving.mi
-        local = mi.warp.square_to_cosine_hemisphere(sampler.surface_2d())
-        return mi.Float(1.0), mi.Float(1.0), self._leaving.along(point, mi.Frame3f(normal).to_world(local))
-
-
-_SEEN_AS: dict[str, Callable[[Leaving, DirectLight], _Lamp | _Point | _Beam | _Sky]]
-_SEEN_AS = {"rectangle": _Lamp, "point": _Point, "beam": _Beam, "sky": _Sky}

@@ -1,6 +1,7 @@
 """Irradiance by a Lambertian rectangle in closed form, on the device."""
 
 from collections.abc import Sequence
+from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,8 @@ from hesim_render.core.device_types import Float, Mask, MitsubaModule, Point2, P
 #: Area over squared distance below which a rectangle counts as a point at its centre: the sum over edges loses its
 #: digits in float32 there, and the relative error of the point is about as large as this number.
 _SMALL_SR = 1e-4
+#: Squared distance from the middle of a ball, over its squared radius, up to which a point is one of its surface.
+BESIDE_BALL = 1.0001
 
 
 class RectangleLight:
@@ -91,6 +94,29 @@ class RectangleLight:
         square = dr.squared_norm(to)
         cosines = dr.maximum(dr.dot(to, normal), 0.0) * dr.maximum(-dr.dot(to, self.normal), 0.0)
         return drawn, dr.select(square > 0, self._area_m2 * cosines / (square * square), 0.0)
+
+
+def ball_above_horizon(towards: Vector3, square: Float, normal: Vector3) -> Float:
+    """∫ cos θ dω over the part above the horizon of a ball, sr.
+
+    Half the integral of r × dr along the rim of what is seen of it, times the normal: an arc of the circle, and, where
+    the ball reaches below, of the horizon.
+
+    Parameters
+    ----------
+    towards : unit vector to the middle of the ball.
+    square : squared sine of its angular radius, below 1.
+    normal : unit normal.
+    """
+    sine, cosine = dr.sqrt(square), dr.sqrt(1 - square)
+    height = dr.clip(dr.dot(towards, normal), -1, 1)
+    across = dr.sqrt(dr.maximum(1 - height * height, 0))
+    # half the arc above the horizon
+    half = dr.acos(dr.clip(-cosine * height / dr.maximum(sine * across, 1e-20), -1, 1))
+    arc = half * square * height - cosine * sine * across * dr.sin(half)
+    level = dr.atan2(sine * dr.sin(half), cosine * across - sine * height * dr.cos(half))
+    # without rounding where all of it is above
+    return dr.select(height >= sine, pi * square * height, dr.maximum(arc + level, 0))
 
 
 def outline_above_horizon(mi: MitsubaModule, rays: Sequence[Vector3], normal: Vector3) -> Float:

@@ -15,8 +15,8 @@ from scipy.spatial import ConvexHull, QhullError
 
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Float, MitsubaModule, MitsubaObject, Point3, Vector3
-from hesim_render.sources.render.scene.mitsuba_version import mesh_faces, mesh_vertices
-from hesim_render.sources.render.transport.irradiance import outline_above_horizon
+from hesim_render.sources.render.scene.mitsuba_version import ball_of, mesh_faces, mesh_vertices
+from hesim_render.sources.render.transport.irradiance import BESIDE_BALL, ball_above_horizon, outline_above_horizon
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.swept_boxes import Moment
 
@@ -27,8 +27,6 @@ _MOST = 8
 _MOST_CORNERS, _MOST_SHAPES, _MOST_TRIANGLES = 8, 64, 100_000
 #: Distance from a plane, over the size of what lies in it, up to which a point lies in the plane.
 _IN_PLANE = 1e-5
-#: Squared distance from the middle of a ball, over its squared radius, up to which a point is one of its surface.
-_BESIDE_BALL = 1.0001
 #: Least part of an outline that the surface must fill.
 _FILLED = 0.98
 
@@ -84,7 +82,8 @@ def outlines_of(scene: MitsubaObject) -> list[Outline | Ball]:
     if len(shapes) > _MOST_SHAPES:
         return []
     if not all(shape.is_mesh() for shape in shapes):
-        return [_ball(shape) for shape in shapes if shape.class_name() == "Sphere"]
+        balls = [ball_of(shape) for shape in shapes if shape.class_name() == "Sphere"]
+        return [Ball(place[:3], float(place[3])) for place in balls]
     if not shapes or sum(shape.face_count() for shape in shapes) > _MOST_TRIANGLES:
         return []
     triangles = [mesh_vertices(shape)[mesh_faces(shape)] for shape in shapes]
@@ -92,11 +91,6 @@ def outlines_of(scene: MitsubaObject) -> list[Outline | Ball]:
     if together is not None:
         return [together]
     return [outline for each in triangles for outline in _of_mesh(each)]
-
-
-def _ball(shape: MitsubaObject) -> Ball:
-    low, high = (np.array(corner, np.float64).ravel() for corner in (shape.bbox().min, shape.bbox().max))
-    return Ball((low + high) / 2, float(np.mean(high - low)) / 2)
 
 
 def _of_mesh(triangles: NDArray[np.float64]) -> list[Outline]:
@@ -240,10 +234,12 @@ class Screen:
             to = middle - point
             distance = dr.squared_norm(to)
             # a point on or in the ball is one of its own surface
-            counts = distance > square * _BESIDE_BALL
+            counts = distance > square * BESIDE_BALL
 
             def behind(to: Vector3, normal: Vector3, direction: Vector3, part: Float) -> tuple[Float, Float]:
-                return _hidden_by_ball(mi, dr.normalize(to), part, normal, direction)
+                towards = dr.normalize(to)
+                hides = dr.dot(direction, towards) > dr.sqrt(1 - part)
+                return ball_above_horizon(towards, part, normal) / pi, dr.select(hides, mi.Float(1.0), 0.0)
 
             part, hides = dr.if_stmt(
                 (to, normal, direction, square / distance),
@@ -254,32 +250,6 @@ class Screen:
             )
             share, count = share + part, count + hides
         return share, count
-
-
-def _hidden_by_ball(
-    mi: MitsubaModule, towards: Vector3, square: Float, normal: Vector3, direction: Vector3
-) -> tuple[Float, Float]:
-    """Share of a uniform sky that a ball hides, and 1 where it hides a direction.
-
-    Half the integral of r × dr along the rim of what is seen of the ball above the horizon, times the normal: an arc
-    of the circle, and, where the ball reaches below, of the horizon.
-
-    Parameters
-    ----------
-    towards : unit vector to the middle of the ball.
-    square : squared sine of its angular radius, below 1.
-    normal, direction : see `Screen.hides`.
-    """
-    sine, cosine = dr.sqrt(square), dr.sqrt(1 - square)
-    height = dr.clip(dr.dot(towards, normal), -1, 1)
-    across = dr.sqrt(dr.maximum(1 - height * height, 0))
-    # half the arc above the horizon; a ball that does not reach it counts with its whole circle
-    turn = -cosine * height / dr.maximum(sine * across, 1e-20)
-    half = dr.acos(dr.clip(turn, -1, 1))
-    arc = half * square * height - cosine * sine * across * dr.sin(half)
-    level = dr.atan2(sine * dr.sin(half), cosine * across - sine * height * dr.cos(half))
-    hides = dr.dot(direction, towards) > cosine
-    return dr.maximum(arc + level, 0) / pi, dr.select(hides, mi.Float(1.0), 0.0)
 
 
 def _margin(outline: Outline) -> float:
