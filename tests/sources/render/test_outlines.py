@@ -11,7 +11,7 @@ from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.transport import outlines
-from hesim_render.sources.render.transport.outlines import Ball, Outline, Screen, largest, outlines_of
+from hesim_render.sources.render.transport.outlines import BallOutline, Outline, Screen, largest, outlines_of
 
 #: A skew quadrilateral in a tilted plane.
 QUAD = np.array([[-0.7, -0.2, 0.1], [0.5, -0.4, 0.3], [0.9, 0.6, 0.52], [-0.3, 0.8, 0.28]])
@@ -74,7 +74,7 @@ def test_the_share_of_a_ball_is_that_of_rays(height, radius_m):
     across = np.cross(towards, [0.6, 0.1, 0.2])
     normal = height * towards + np.sqrt(1 - height**2) * across / np.linalg.norm(across)
     along = directions(normal, 100_000, np.random.default_rng(8))
-    ball = Ball(point + along_middle, radius_m)
+    ball = BallOutline(point + along_middle, radius_m)
     share, count = hides([ball], np.tile(point, (100_000, 1)), np.tile(normal, (100_000, 1)), along)
     nearest = along @ along_middle
     expected = (nearest > 0) & (along_middle @ along_middle - nearest**2 < radius_m**2)
@@ -87,7 +87,7 @@ def test_the_share_of_a_ball_is_that_of_rays(height, radius_m):
 
 
 def test_a_ball_hides_nothing_from_itself_and_most_from_where_it_touches():
-    ball, up = Ball(np.array([0.1, 0.2, 0.5]), 0.2), np.array([[0.0, 0.0, 1.0]] * 4)
+    ball, up = BallOutline(np.array([0.1, 0.2, 0.5]), 0.2), np.array([[0.0, 0.0, 1.0]] * 4)
     out = np.array([0.3, 0.6, 0.742])
     own = [
         ball.middle + 0.2 * out / np.linalg.norm(out),
@@ -166,7 +166,7 @@ def test_only_flat_and_filled_shapes_have_an_outline():
     assert known.middle == pytest.approx([0.2, -0.1, 0.4]) and known.radius_m == pytest.approx(0.3)
     # of a part with other forms, its balls
     among = {"type": "scene", "ball": ball, "plate": {"type": "rectangle"}, "tube": {"type": "cylinder"}}
-    assert [type(each) for each in outlines_of(mi.load_dict(among))] == [Ball]
+    assert [type(each) for each in outlines_of(mi.load_dict(among))] == [BallOutline]
 
 
 def test_the_largest_outlines_count():

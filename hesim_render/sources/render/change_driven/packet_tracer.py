@@ -126,10 +126,10 @@ class PacketTracer(Tracer):
         self.rays.require_one_path()
         self.parts = MovingScene(self.built)
         self._integrator: DiffuseIntegrator | PathIntegrator
-        if self.built.matt is not None:
-            self._integrator = DiffuseIntegrator(self.parts, self.built.matt, self.sensor.responses)
+        if self.built.diffuse is not None:
+            self._integrator = DiffuseIntegrator(self.parts, self.built.diffuse, self.sensor.responses)
             # the integrator has what it needs of the pictures, which are large
-            self.built.matt = None
+            self.built.diffuse = None
         else:
             depth, roulette = path_depths(self.built.integrator)
             self._integrator = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))

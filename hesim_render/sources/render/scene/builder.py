@@ -11,8 +11,8 @@ from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene import lights
 from hesim_render.sources.render.scene.deformation import Deformation
+from hesim_render.sources.render.scene.diffuse_scene import DiffuseScene
 from hesim_render.sources.render.scene.direct_lights import DirectLight, direct_lights
-from hesim_render.sources.render.scene.matt_scene import MattScene
 from hesim_render.sources.render.scene.mesh_file import mesh_shapes
 from hesim_render.sources.render.scene.mitsuba_scene import MitsubaCamera, load_mitsuba, path_tracer
 from hesim_render.sources.render.scene.mitsuba_version import (
@@ -63,7 +63,7 @@ class BuiltScene:
     groups : movable shapes by name: ``target``, an object's name, a Mitsuba shape id.
     trajectories : tracks of the groups that really move.
     is_dark : True where nothing emits.
-    matt : surfaces and lights, if all surfaces are diffuse, the light is direct, and that of all lights has a closed
+    diffuse : surfaces and lights, if all surfaces are diffuse, the light is direct, and that of all lights has a closed
         form; otherwise None. What traces the scene takes it, because pictures in it are large.
     exact_because : why the scene needs the exact mode; None if it does not.
     camera : the Mitsuba scene's own camera, if it is used.
@@ -80,7 +80,7 @@ class BuiltScene:
     groups: dict[str, list[Movable]]
     trajectories: dict[str, Trajectory]
     is_dark: bool
-    matt: MattScene | None
+    diffuse: DiffuseScene | None
     exact_because: str | None = None
     camera: MitsubaCamera | None = None
     integrator_plugin: dict[str, Any] | None = None
@@ -152,9 +152,9 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
         plugin = loaded.integrator_plugin
         groups: dict[str, list[str]] = {}
         deformations: dict[str, Deformation] = {}
-        matt = loaded.matt
+        diffuse = loaded.diffuse
     else:
-        content, groups, matt, deformations = _describe(mi, spec)
+        content, groups, diffuse, deformations = _describe(mi, spec)
         if deformations:
             because = f"object {next(iter(deformations))!r} changes its shape"
         with as_spec_error(spec.file):
@@ -187,7 +187,7 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
         groups=movable,
         trajectories={name: track for name, track in tracks.items() if track.moves},
         is_dark=len(scene.emitters()) == 0,
-        matt=matt if _is_direct(integrator) and _fits(matt, responses) else None,
+        diffuse=diffuse if _is_direct(integrator) and _fits(diffuse, responses) else None,
         exact_because=because,
         camera=camera,
         integrator_plugin=plugin,
@@ -201,15 +201,15 @@ def _is_direct(integrator: MitsubaObject) -> bool:
     return integrator.class_name() in ("DirectIntegrator", "PathIntegrator") and path_depths(integrator)[0] == 2
 
 
-def _fits(matt: MattScene | None, responses: Mapping[str, Spectrum] | None) -> bool:
+def _fits(diffuse: DiffuseScene | None, responses: Mapping[str, Spectrum] | None) -> bool:
     """True if the numbers of all texels fit into memory."""
     filters = 1 if responses is None else len(responses)
-    return matt is not None and are_few(matt.paints, len(matt.lights) * filters)
+    return diffuse is not None and are_few(diffuse.paints, len(diffuse.lights) * filters)
 
 
 def _describe(
     mi: MitsubaModule, spec: SceneSpec
-) -> tuple[dict[str, Any], dict[str, list[str]], MattScene | None, dict[str, Deformation]]:
+) -> tuple[dict[str, Any], dict[str, list[str]], DiffuseScene | None, dict[str, Deformation]]:
     """Mitsuba's dictionary of a scene file, the shape ids of each movable name, surfaces and lights (None if a shape
     is not diffuse, or shines and has no closed form), and the objects that change their shape.
     """
@@ -255,8 +255,8 @@ def _describe(
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
     has_map = any(light.type == "environment" for light in spec.lights)
-    matt = MattScene(paints, direct_lights(spec.lights, shining)) if all_diffuse and not has_map else None
-    return content, groups, matt, deformations
+    diffuse = DiffuseScene(paints, direct_lights(spec.lights, shining)) if all_diffuse and not has_map else None
+    return content, groups, diffuse, deformations
 
 
 def _without_normals(item: ObjectSpec, spec: SceneSpec, groups: Mapping[str, list[str]]) -> list[str]:

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
-from hesim_render.sources.render.scene.files import require_short_number
-from hesim_render.sources.render.scene.matt_scene import (
-    MattScene,
-    ParsedMattScene,
-    loaded_matt_scene,
-    parsed_matt_scene,
+from hesim_render.sources.render.scene.diffuse_scene import (
+    DiffuseScene,
+    ParsedDiffuseScene,
+    loaded_diffuse_scene,
+    parsed_diffuse_scene,
 )
+from hesim_render.sources.render.scene.files import require_short_number
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, box_corners, transform
 from hesim_render.sources.render.scene.parsed_scene import load_mitsuba_scene, switch_off
 from hesim_render.sources.render.scene.plugin_tables import require_known
@@ -50,7 +50,7 @@ class MitsubaScene:
     integrator_plugin : plugin description of the integrator; None if it was given as an object.
     exact_because : why the scene needs the exact mode; None if it does not.
     camera : its first sensor, if there is one and the scene file has no camera.
-    matt : its surfaces and lights, if all are diffuse and of closed form; otherwise None.
+    diffuse : its surfaces and lights, if all are diffuse and of closed form; otherwise None.
     """
 
     scene: MitsubaObject
@@ -58,7 +58,7 @@ class MitsubaScene:
     integrator_plugin: dict[str, Any] | None
     exact_because: str | None
     camera: "MitsubaCamera | None"
-    matt: MattScene | None
+    diffuse: DiffuseScene | None
 
 
 def load_mitsuba(mi: MitsubaModule, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
@@ -93,7 +93,7 @@ def load_mitsuba(mi: MitsubaModule, spec: SceneSpec, source: MitsubaSpec) -> Mit
     reason: str | None = None
     camera: Used | None = None
     plugin: dict[str, Any] | None = None
-    parsed: ParsedMattScene | None = None
+    parsed: ParsedDiffuseScene | None = None
 
     def check(state: Any) -> None:
         nonlocal reason, camera, plugin, parsed
@@ -105,7 +105,7 @@ def load_mitsuba(mi: MitsubaModule, spec: SceneSpec, source: MitsubaSpec) -> Mit
         if spec.max_depth is not None:
             set_depth(used, spec.max_depth)
         plugin = integrator_plugin(used, {"type": "path", "max_depth": spec.max_depth or _DEFAULT_DEPTH, **_ROULETTE})
-        parsed = parsed_matt_scene(state)
+        parsed = parsed_diffuse_scene(state)
 
     def check_and_switch_off(state: Any) -> None:
         nonlocal parsed
@@ -114,7 +114,7 @@ def load_mitsuba(mi: MitsubaModule, spec: SceneSpec, source: MitsubaSpec) -> Mit
             switch_off(state, source.may_shine, [*(source.lit or ()), *source.unlit, *source.waveforms])
         except SpecError as error:
             raise SpecError(str(error), file=spec.file, key="mitsuba") from None
-        parsed = parsed_matt_scene(state)
+        parsed = parsed_diffuse_scene(state)
 
     scene = load(check)
     meant_dark = bool(spec.lights)  # of type 'none', or the scene file would have been refused
@@ -131,8 +131,10 @@ def load_mitsuba(mi: MitsubaModule, spec: SceneSpec, source: MitsubaSpec) -> Mit
         scene = load(check_and_switch_off)
     integrator = scene.integrator() or mi.load_dict(plugin)
     seen = None if camera is None else MitsubaCamera.of(mi, scene, camera)
-    matt = None if parsed is None else loaded_matt_scene(mi, scene, parsed)
-    return MitsubaScene(scene, integrator, plugin, reason, seen, matt)
+    # scalar variants trace one ray at a time, in the exact mode
+    is_vectorised = not mi.variant().startswith("scalar")
+    diffuse = loaded_diffuse_scene(mi, scene, parsed) if parsed is not None and is_vectorised else None
+    return MitsubaScene(scene, integrator, plugin, reason, seen, diffuse)
 
 
 def path_tracer(mi: MitsubaModule, depth: int) -> MitsubaObject:

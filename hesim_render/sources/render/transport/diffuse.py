@@ -33,9 +33,9 @@ from hesim_render.core.device_types import (
     UInt32,
 )
 from hesim_render.core.host_arrays import from_host
-from hesim_render.sources.render.scene.matt_scene import MattScene
+from hesim_render.sources.render.scene.diffuse_scene import DiffuseScene
 from hesim_render.sources.render.scene.pictures import TextureData
-from hesim_render.sources.render.transport.light_sources import RectangleLamp, Sky, light_source
+from hesim_render.sources.render.transport.light_sources import BallLamp, RectangleLamp, Sky, light_source
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.occluded_lamps import SLOTS, LampShadows
 from hesim_render.sources.render.transport.outlines import OccludedSky
@@ -57,27 +57,27 @@ class DiffuseIntegrator:
     Parameters
     ----------
     scene : the scene to trace.
-    matt : its paints and lights.
+    diffuse : its paints and lights.
     responses : R per filter, in the order of the filter index; e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹.
     """
 
-    def __init__(self, scene: MovingScene, matt: MattScene, responses: Mapping[str, Spectrum]) -> None:
+    def __init__(self, scene: MovingScene, diffuse: DiffuseScene, responses: Mapping[str, Spectrum]) -> None:
         self._scene = scene
         #: Objects that compute e_k and draw a point, in the order of the scene's lights.
-        self._lights = [light_source(scene.leaving, light) for light in matt.lights]
-        irradiances = [light.level for light in matt.lights]
+        self._lights = [light_source(scene.leaving, light) for light in diffuse.lights]
+        irradiances = [light.level for light in diffuse.lights]
         # a ray that hits the light itself carries its strength
-        strengths = [light.strength for light in matt.lights]
-        lamp_of = {light.shape: number for number, light in enumerate(matt.lights) if light.shape is not None}
-        self._has_sky = bool(matt.lights) and matt.lights[-1].kind == "sky"
+        strengths = [light.strength for light in diffuse.lights]
+        lamp_of = {light.shape: number for number, light in enumerate(diffuse.lights) if light.shape is not None}
+        self._has_sky = bool(diffuse.lights) and diffuse.lights[-1].kind == "sky"
         self._outlines = OccludedSky(scene) if self._has_sky else None
-        self._shadows = LampShadows(scene) if any(light.kind == "rectangle" for light in matt.lights) else None
+        self._shadows = LampShadows(scene) if any(light.kind == "rectangle" for light in diffuse.lights) else None
         black = constant(0.0)
         colours: list[Spectrum] = [black]
         rows: dict[str, list[float]] = {}
         # numbers from 1, of pictures that repeat or not; parts of an object share one
         pictures: dict[tuple[Picture | TextureData, bool], int] = {}
-        for paint in matt.paints:
+        for paint in diffuse.paints:
             numbers = [len(colours) + k for k in range(len(paint.colours))]
             colours += paint.colours
             own = 0
@@ -86,7 +86,7 @@ class DiffuseIntegrator:
             rows[paint.shape] = [numbers[0], numbers[-1], 1.0 + paint.two_sided, 0.0, *paint.scale, own, 0.0]
         for shape, number in lamp_of.items():
             rows.setdefault(shape, [0.0] * _ROW)[3] = number + 1.0
-        self._has_checks = any(len(paint.colours) > 1 for paint in matt.paints)
+        self._has_checks = any(len(paint.colours) > 1 for paint in diffuse.paints)
         self._tables(rows, colours, irradiances, strengths, list(responses.values()))
         of_lights = irradiances, list(responses.values())
         # without light there is nothing to see of a picture
@@ -143,7 +143,7 @@ class DiffuseIntegrator:
         Returns
         -------
         controlled, plain : Float, both estimates of the flux, e⁻/s; with `shadows`, the controlled one twice.
-        unshadowed : Float, the flux if nothing hid any light but `shadows` of a single shape, e⁻/s.
+        unshadowed : Float, the flux if nothing hid any light, e⁻/s, but for `shadows` of a single shape, and for balls.
         met : Bool, True where the path came through the box of a moving object.
         """
         mi, scene = self._scene.mi, self._scene
@@ -204,6 +204,9 @@ class DiffuseIntegrator:
                 known = open_ - part + hides
             controlled = dr.fma(scale, dr.select(blocked, known - share, known), controlled)
             plain = dr.fma(scale, dr.select(blocked, 0.0, share), plain)
+            if isinstance(light, BallLamp):
+                # the housing of a lamp hides a part of it from everywhere
+                open_ = dr.select(blocked, 0.0, open_)
             unshadowed = dr.fma(scale, open_, unshadowed)
         # known shadows are known in all windows, so there is no choice
         return controlled, plain if shadows is None else controlled, unshadowed, met

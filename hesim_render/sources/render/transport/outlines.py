@@ -57,7 +57,7 @@ class Outline:
 
 
 @dataclass(frozen=True)
-class Ball:
+class BallOutline:
     """A ball, which hides a circle of directions.
 
     Parameters
@@ -74,7 +74,7 @@ class Ball:
         return pi * self.radius_m**2
 
 
-def outlines_of(scene: MitsubaObject) -> list[Outline | Ball]:
+def outlines_of(scene: MitsubaObject) -> list[Outline | BallOutline]:
     """Outlines of the shapes of a part: of all of them together, if they lie in one plane and fill their hull; else of
     each one that is flat, a ball, or closed and convex with few faces.
     """
@@ -83,7 +83,7 @@ def outlines_of(scene: MitsubaObject) -> list[Outline | Ball]:
         return []
     if not all(shape.is_mesh() for shape in shapes):
         balls = [ball_of(shape) for shape in shapes if shape.class_name() == "Sphere"]
-        return [Ball(place[:3], float(place[3])) for place in balls]
+        return [BallOutline(place[:3], float(place[3])) for place in balls]
     if not shapes or sum(shape.face_count() for shape in shapes) > _MOST_TRIANGLES:
         return []
     triangles = [mesh_vertices(shape)[mesh_faces(shape)] for shape in shapes]
@@ -174,7 +174,7 @@ class Screen:
     outlines : one or more.
     """
 
-    def __init__(self, mi: MitsubaModule, outlines: Sequence[Outline | Ball]) -> None:
+    def __init__(self, mi: MitsubaModule, outlines: Sequence[Outline | BallOutline]) -> None:
         self._mi = mi
         flat = [each for each in outlines if isinstance(each, Outline)]
         self._sides = [each.one_sided for each in flat]
@@ -185,7 +185,7 @@ class Screen:
         ]
         #: Centre and squared radius of each ball.
         self._balls = [
-            (mi.Point3f(each.middle), mi.Float(each.radius_m**2)) for each in outlines if isinstance(each, Ball)
+            (mi.Point3f(each.middle), mi.Float(each.radius_m**2)) for each in outlines if isinstance(each, BallOutline)
         ]
         dr.make_opaque(self._corners, self._planes, self._balls)
 
@@ -256,7 +256,7 @@ def _margin(outline: Outline) -> float:
     return _IN_PLANE * float(np.linalg.norm(np.ptp(outline.corners, axis=0)))
 
 
-def largest(parts: Sequence[Sequence[Outline | Ball]]) -> list[list[Outline | Ball]]:
+def largest(parts: Sequence[Sequence[Outline | BallOutline]]) -> list[list[Outline | BallOutline]]:
     """The largest outlines of several parts, at most `_MOST` in all; of equal ones the first."""
     every = [(number, outline) for number, part in enumerate(parts) for outline in part]
     kept = sorted(every, key=lambda one: -one[1].area_m2)[:_MOST]

@@ -35,7 +35,7 @@ _JUMP_NM = 1e-3
 
 
 @dataclass(frozen=True)
-class MattScene:
+class DiffuseScene:
     """Diffuse surfaces and the lights on them.
 
     Parameters
@@ -71,21 +71,21 @@ class ParsedPaint:
 
 
 @dataclass(frozen=True)
-class ParsedMattScene:
+class ParsedDiffuseScene:
     """Surfaces of a parsed scene, and kinds of its lights that no shape is."""
 
     paints: list[ParsedPaint]
     lights: list[str]
 
 
-def parsed_matt_scene(state: Any) -> ParsedMattScene | None:
+def parsed_diffuse_scene(state: Any) -> ParsedDiffuseScene | None:
     """What the parser of Mitsuba says of a scene of diffuse surfaces under lights of closed form; None of others.
 
     Parameters
     ----------
     state : the `ParserState`.
     """
-    nodes, result = state.nodes, ParsedMattScene([], [])
+    nodes, result = state.nodes, ParsedDiffuseScene([], [])
     if any(_has_objects(node) for node in nodes):
         return None
     for number in children_of(nodes[0]):
@@ -179,7 +179,7 @@ def _textures(nodes: Sequence[Any], node: Any) -> dict[str, Any]:
     return {key: nodes[node.props[key].index()] for key in keys}
 
 
-def loaded_matt_scene(mi: MitsubaModule, scene: MitsubaObject, parsed: ParsedMattScene) -> MattScene | None:
+def loaded_diffuse_scene(mi: MitsubaModule, scene: MitsubaObject, parsed: ParsedDiffuseScene) -> DiffuseScene | None:
     """The paints and lights of a loaded scene; None if one of them has no closed form.
 
     Parameters
@@ -194,7 +194,7 @@ def loaded_matt_scene(mi: MitsubaModule, scene: MitsubaObject, parsed: ParsedMat
         return None
     if len(lights) != len(parsed.lights):
         return None
-    reader, result = _Reader(mi), MattScene([], [])
+    reader, result = _Reader(mi), DiffuseScene([], [])
     for name, shape, paint in zip(names_of(shapes), shapes, parsed.paints, strict=True):
         picture = reader.picture(shape, paint)
         if paint.texture == "picture" and picture is None:

@@ -85,7 +85,7 @@ def loaded(folder, text=SCENE, motion="[]", **extra):
     (folder / "scene.xml").write_text(text)
     given = {"file": "scene.xml", "radiance_scale": 0.37, **extra}
     (folder / "scene.yaml").write_text(
-        "schema_version: 1\nname: matt\ndescription: ''\n"
+        "schema_version: 1\nname: diffuse\ndescription: ''\n"
         "camera: {origin_m: [0.03, 0.02, 2], target_m: [0.01, 0, 0], horizontal_fov_deg: 22.62}\n"
         f"mitsuba: {given}\nmotion: {motion}\n"
     )
@@ -124,7 +124,7 @@ def test_closed_form_sees_what_mitsubas_paths_see(tmp_path):
 def test_a_lamp_that_is_off_stays_as_a_painted_surface(tmp_path):
     sensor, scene = hr.load_sensor("gen2").crop(60, 44, 1400, 1000), loaded(tmp_path, unlit=["lamp"])
     tracer = pair_tracer(scene, sensor)
-    kinds = [light.kind for light in build(mitsuba(), scene.spec).matt.lights]
+    kinds = [light.kind for light in build(mitsuba(), scene.spec).diffuse.lights]
     assert kinds == ["rectangle", "ball", "point", "beam", "sky"]
     assert tracer.is_diffuse
     assert_same(tracer, scene, sensor)
@@ -133,7 +133,7 @@ def test_a_lamp_that_is_off_stays_as_a_painted_surface(tmp_path):
 def test_spectra_and_places_of_surfaces_and_lights_are_those_of_the_file(tmp_path):
     mi = mitsuba()
     built = build(mi, loaded(tmp_path).spec)
-    paints = {paint.shape: paint for paint in built.matt.paints}
+    paints = {paint.shape: paint for paint in built.diffuse.paints}
     assert names_of(built.scene.shapes()) == list(paints)
     assert list(paints) == ["shape_0", "board", "back-to-front", "shape_3", "block", "lamp", "panel", "bulb"]
     floor = paints["shape_0"]
@@ -143,7 +143,7 @@ def test_spectra_and_places_of_surfaces_and_lights_are_those_of_the_file(tmp_pat
         [0, 0, 0.05, 0.075, 0.1, 0.44, 0.95, 0.1 + 0.3 * 37 / 77, 0.4, 0], abs=1e-5
     )
     assert paints["block"].colours[0].at([400, 700]) == pytest.approx(0.5)
-    lamp, panel, bulb, point, beam, sky = built.matt.lights
+    lamp, panel, bulb, point, beam, sky = built.diffuse.lights
     assert bulb.shape == "bulb" and bulb.place == pytest.approx([-0.02, -0.2, -0.06, 0.055], abs=1e-6)
     assert bulb.strength.at(500) == pytest.approx(0.35)
     assert lamp.shape == "lamp" and panel.shape == "panel" and point.shape is None
@@ -189,10 +189,10 @@ def test_objects_that_shine_are_seen_in_closed_form():
     (first, *_) = flux.flux_of_blocks(np.arange(16 * 12, dtype=np.uint32), flux.sample_blocks(1, 0, 1000))
     assert np.all(np.isfinite(np.array(first.half_a)))
     block = panel | {"shape": "box", "size_m": [0.1, 0.2, 0.02]}
-    assert build(mitsuba(), make_scene(objects=[*objects, block], camera=camera, light=light).spec).matt is None
+    assert build(mitsuba(), make_scene(objects=[*objects, block], camera=camera, light=light).spec).diffuse is None
     dark = [*objects, block | {"emission": {"luminance_cd_m2": 0}}]
-    matt = build(mitsuba(), make_scene(objects=dark, camera=camera, light=light).spec).matt
-    assert [each.kind for each in matt.lights] == ["ball", "ball", "sky"]
+    diffuse = build(mitsuba(), make_scene(objects=dark, camera=camera, light=light).spec).diffuse
+    assert [each.kind for each in diffuse.lights] == ["ball", "ball", "sky"]
 
 
 def test_what_balls_give_is_what_rays_bring():
@@ -260,16 +260,16 @@ def test_what_has_no_closed_form_is_seen_by_paths(tmp_path, old, new):
     text = text.replace(*second) if second else text
     assert text != SCENE
     scene = loaded(tmp_path, text)
-    assert build(mitsuba(), scene.spec).matt is None
+    assert build(mitsuba(), scene.spec).diffuse is None
     assert not pair_tracer(scene, mono(8, 6)).is_diffuse
 
 
 def test_surfaces_that_were_made_before_are_seen_by_paths():
     """The parser says nothing of them."""
     mi, shapes = mitsuba(), {"wall": {"type": "rectangle"}, "light": {"type": "constant"}}
-    assert build(mi, mitsuba_scene(shapes, depth=2).spec).matt is not None
+    assert build(mi, mitsuba_scene(shapes, depth=2).spec).diffuse is not None
     shapes["wall"]["bsdf"] = mi.load_dict({"type": "plastic"})
-    assert build(mi, mitsuba_scene(shapes, depth=2).spec).matt is None
+    assert build(mi, mitsuba_scene(shapes, depth=2).spec).diffuse is None
 
 
 def test_a_direct_integrator_has_depth_2(tmp_path):
@@ -279,8 +279,8 @@ def test_a_direct_integrator_has_depth_2(tmp_path):
         SCENE.replace('value="2"/></int', 'value="8"/></int'),
     ):
         scene = loaded(tmp_path, text)
-        assert (build(mitsuba(), scene.spec).matt is None) == ('"8"' in text)
-    assert build(mitsuba(), hr.load_scene(tmp_path / "scene.yaml", {"max_depth": 2}).spec).matt is not None
+        assert (build(mitsuba(), scene.spec).diffuse is None) == ('"8"' in text)
+    assert build(mitsuba(), hr.load_scene(tmp_path / "scene.yaml", {"max_depth": 2}).spec).diffuse is not None
 
 
 def test_moving_shapes_have_the_wanted_error_in_the_default_mode(tmp_path, monkeypatch):
