@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Bands, Interaction, MitsubaModule, MitsubaObject
+from hesim_render.core.errors import SpecError
 from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.direct_lights import DirectLight
 from hesim_render.sources.render.scene.mitsuba_version import ball_of, names_of, rectangle_frame
@@ -194,7 +195,17 @@ def loaded_diffuse_scene(mi: MitsubaModule, scene: MitsubaObject, parsed: Parsed
         return None
     if len(lights) != len(parsed.lights):
         return None
-    reader, result = _Reader(mi), DiffuseScene([], [])
+    try:
+        return _read(_Reader(mi), shapes, lights, parsed)
+    except SpecError:
+        return None  # a spectrum that is not finite, of which a render says who sees it
+
+
+def _read(
+    reader: "_Reader", shapes: Sequence[MitsubaObject], lights: Sequence[MitsubaObject], parsed: ParsedDiffuseScene
+) -> DiffuseScene | None:
+    """See `loaded_diffuse_scene`."""
+    result = DiffuseScene([], [])
     for name, shape, paint in zip(names_of(shapes), shapes, parsed.paints, strict=True):
         picture = reader.picture(shape, paint)
         if paint.texture == "picture" and picture is None:
