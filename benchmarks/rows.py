@@ -5,8 +5,8 @@
 Each row is a run of `hesim-render simulate` in a process of its own, in the default mode with its audit: a reference
 with other random numbers, which says by how many noise units event pixels deviate, and how many of its events the run
 misses. Rows that take hours are forecast only, by `--dry-run`; `--forecast` forecasts all. Times are of this machine,
-rays are the same on all. Nothing was tuned on the rows marked with *. The last five are Mitsuba XML with light that
-bounces, 64×48 pixels of it (`benchmarks/scenes`).
+rays are the same on all. Nothing was tuned on the rows marked with *. The last seven are Mitsuba XML,
+64×48 pixels of it (`benchmarks/scenes`): five with light that bounces, two with direct light alone.
 """
 
 import argparse
@@ -36,7 +36,7 @@ ROWS = {
     "glass": ("glass-and-metal", "davis346", 0.02, False),
     **{
         name: (str(SCENES / f"{name.strip('*')}.yaml"), "davis346", 0.02, True)
-        for name in ("room", "floor-ball", "sky-knot*", "copper*", "glass-ball*")
+        for name in ("room", "floor-ball", "sky-knot*", "copper*", "glass-ball*", "room-direct*", "floor-ball-direct*")
     },
 }
 

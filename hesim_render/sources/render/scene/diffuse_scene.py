@@ -17,7 +17,7 @@ from hesim_render.core.device_types import Bands, Interaction, MitsubaModule, Mi
 from hesim_render.core.errors import SpecError
 from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.direct_lights import DirectLight
-from hesim_render.sources.render.scene.mitsuba_version import ball_of, names_of, rectangle_frame
+from hesim_render.sources.render.scene.mitsuba_version import ball_of, matrix_of, names_of
 from hesim_render.sources.render.scene.parsed_scene import children_of
 from hesim_render.sources.render.scene.pictures import TextureData
 from hesim_render.sources.render.scene.surfaces import Paint
@@ -270,7 +270,8 @@ class _Reader:
 
     def frame(self, shape: MitsubaObject) -> NDArray[np.float64] | None:
         """The frame of a rectangle, see `area_light_frame`; None if it has no right angles."""
-        mi, frame = self._mi, rectangle_frame(shape)
+        mi = self._mi
+        frame = matrix_of(mi.traverse(shape)["to_world"])
         width, height = frame[:3, 0].copy(), frame[:3, 1]
         if abs(width @ height) > _RIGHT_ANGLED * np.linalg.norm(width) * np.linalg.norm(height):
             return None
@@ -291,7 +292,7 @@ class _Reader:
             # a point at a distance of 1 m receives the intensity
             strength = self._from(light, position + np.array([0.0, 0.0, 1.0]))
             return DirectLight("point", strength, 1.0, position)
-        matrix = np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4, -1)[:, :, 0]
+        matrix = matrix_of(parameters["to_world"])
         direction = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
         return DirectLight("beam", self._from(light, np.zeros(3)), 1.0, direction)
 

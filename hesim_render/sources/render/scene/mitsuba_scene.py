@@ -18,7 +18,7 @@ from hesim_render.sources.render.scene.diffuse_scene import (
     parsed_diffuse_scene,
 )
 from hesim_render.sources.render.scene.files import require_short_number
-from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, box_corners, transform
+from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, box_corners, matrix_of, transform
 from hesim_render.sources.render.scene.parsed_scene import load_mitsuba_scene, switch_off
 from hesim_render.sources.render.scene.plugin_tables import require_known
 from hesim_render.sources.render.scene.plugins import (
@@ -206,7 +206,7 @@ class MitsubaCamera:
         if sensor.shutter_open_time() > 0:
             raise used.refused("its shutter_open and shutter_close are an exposure, which the sensor file gives; "
                                "remove them")  # fmt: skip
-        to_world = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4, -1)[:, :, 0]
+        to_world = matrix_of(parameters["to_world"])
         far, depth = float(parameters["far_clip"]), _farthest(scene, to_world)
         if depth > far:
             raise used.refused(

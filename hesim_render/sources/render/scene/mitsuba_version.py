@@ -164,11 +164,9 @@ def ball_of(shape: MitsubaObject) -> NDArray[np.float64]:
     return np.array([*(low + high) / 2, np.mean(high - low) / 2])
 
 
-def rectangle_frame(shape: MitsubaObject) -> NDArray[np.float64]:
-    """Placement [4, 4] of a rectangle of Mitsuba, whose corners are at -1 and 1 along x and y."""
-    import mitsuba as mi
-
-    matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64)
+def matrix_of(placement: MitsubaObject) -> NDArray[np.float64]:
+    """Matrix [4, 4] of a transform among an object's parameters."""
+    matrix = np.array(placement.matrix, np.float64)
     return matrix.reshape(4, 4, -1)[:, :, 0]
 
 
@@ -191,8 +189,7 @@ class Movable:
             self._normals = vertex_normals(parameters, prefix)
             self.corners = box_corners(self._vertices.min(axis=0), self._vertices.max(axis=0))
         else:
-            matrix = np.array(parameters[f"{prefix}.to_world"].matrix, dtype=np.float64)
-            self._to_world = matrix.reshape(matrix.shape[0], matrix.shape[1], -1)[:, :, 0]
+            self._to_world = matrix_of(parameters[f"{prefix}.to_world"])
             if shape.class_name() == "Instance":
                 box = shape.bbox()
                 self.corners = box_corners(np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel())

@@ -1,8 +1,9 @@
-"""Flat convex outlines of what may hide a uniform sky, and the share of the sky that they hide, in closed form.
+"""Flat convex outlines and balls that may hide a uniform sky, and the share of the sky that they hide, in closed form.
 
 A flat target hides from a point of a wall a part of the sky that Lambert's formula gives, and so does a closed convex
-body, face by face. Direct light takes these shares as a control variate (`transport.diffuse`): shadow rays then only
-correct what the outlines do not describe, such as holes, other forms, and two outlines behind each other.
+body, face by face; the share of a ball has a formula of its own. Direct light takes these shares as a control variate
+(`transport.diffuse`): shadow rays then only correct what the outlines do not describe, such as holes, other forms, and
+two outlines behind each other.
 """
 
 from collections.abc import Sequence
