@@ -167,7 +167,7 @@ def test_the_estimate_of_a_block_knows_of_bends_and_that_of_a_window_does_not(mo
     rays = source.foresight.block(pixel, block.begin_us, block.end_us, "events").rays[0]
     asked = []
     monkeypatch.setattr(
-        adaptive, "straightened", lambda tracer, index, windows, what, tuning: (asked.append(1), what)[1]
+        adaptive, "straightened", lambda tracer, index, windows, what, tuning, among: (asked.append(1), what)[1]
     )
     assert rays < 0.7 * source.foresight.block(pixel, block.begin_us, block.end_us, "events").rays[0] and asked
     asked.clear()

@@ -247,38 +247,84 @@ RED = '<rgb name="reflectance" value="0.61, 0.33, 0.2"/>'
 BITMAP = '<texture type="bitmap" name="{}"><string name="filename" value="colour.png"/>{}</texture>'
 
 
+def changed(text, old, new):
+    """A text with one thing changed. (|old|new is a second one.)"""
+    new, *second = new.split("|")
+    text, before = text.replace(old, new), text
+    assert text != before
+    return text.replace(*second) if second else text
+
+
 @pytest.mark.parametrize(
     "old, new",
     [
-        ('name="max_depth" value="2"', 'name="max_depth" value="3"'),
-        ('<ref id="clay"/></shape>', '<ref id="spare"/></shape>'),
-        (f'<bsdf type="diffuse" id="clay">{RED}</bsdf>', '<bsdf type="plastic" id="clay"/>'),
-        ('<ref id="clay"/></bsdf>', '<ref id="clay"/><ref id="spare"/></bsdf>'),
         ('<shape type="cube" id="block">', '<shape type="cube" id="block"><emitter type="area"/>'),
         ('<shape type="sphere" id="bulb">', '<shape type="sphere"><boolean name="flip_normals" value="true"/>'),
         ('<scale x="-0.06" y="0.11"/>', '<scale x="-0.06" y="0.11"/><rotate z="1" angle="20"/><scale x="2"/>'),
         ('<rgb name="radiance" value="0.6, 0.9, 0.7"/>', BITMAP.format("radiance", "")),
-        ('<scale x="1.5" y="2"/>', '<scale x="1.5" y="2"/><rotate z="1" angle="10"/>'),
-        ('<scale x="1.3"/>', '<scale x="1.3"/><translate x="0.2"/>'),
-        ('value="clamp"', 'value="mirror"'),
         ('<shape type="cube" id="block">', '<shape type="merge"><shape type="cube"/></shape><shape type="cube">'),
-        ('value="clamp"/>', 'value="clamp"/><boolean name="raw" value="true"/>|grey.png|colour.png'),
         ('<emitter type="point">', '<emitter type="point"><float name="sampling_weight" value="0"/>'),
         ('<emitter type="point"><point name="position" x="-0.4" y="0.3" z="0.7"/>', '<emitter type="spot">'),
-        ('<rgb name="color0" value="0.7, 0.65, 0.5"/>', BITMAP.format("color0", "")),
+        ('name="max_depth" value="2"', 'name="max_depth" value="1"'),
+        # surfaces of lamps
+        (f'<bsdf type="diffuse" id="clay">{RED}</bsdf>', '<bsdf type="plastic" id="clay"/>'),
+        ('<ref id="clay"/></bsdf>', '<ref id="clay"/><ref id="spare"/></bsdf>'),
         (RED, BITMAP.format("reflectance", '<transform name="to_uv"><scale x="0"/></transform>')),
         (RED, '<texture type="mesh_attribute" name="reflectance"><string name="name" value="vertex_a"/></texture>'),
     ],
 )  # fmt: skip
-def test_what_has_no_closed_form_is_seen_by_paths(tmp_path, old, new):
-    """One thing is changed in each case. (|old|new is a second one.)"""
-    new, *second = new.split("|")
-    text = SCENE.replace(old, new)
-    text = text.replace(*second) if second else text
-    assert text != SCENE
-    scene = loaded(tmp_path, text)
+def test_light_that_has_no_closed_form_is_seen_by_paths(tmp_path, old, new):
+    """One thing is changed in each case."""
+    scene = loaded(tmp_path, changed(SCENE, old, new))
     assert build(mitsuba(), scene.spec).diffuse is None
-    assert not pair_tracer(scene, mono(8, 6)).is_diffuse
+    tracer = pair_tracer(scene, mono(8, 6))
+    assert not (tracer.is_diffuse or tracer.has_bounced)
+
+
+@pytest.mark.parametrize(
+    "old, new, others",
+    [
+        ('name="max_depth" value="2"', 'name="max_depth" value="3"', 0),
+        ('<ref id="clay"/></shape>', '<ref id="spare"/></shape>', 1),
+        ('<scale x="1.5" y="2"/>', '<scale x="1.5" y="2"/><rotate z="1" angle="10"/>', 1),
+        ('<scale x="1.3"/>', '<scale x="1.3"/><translate x="0.2"/>', 1),
+        ('value="clamp"', 'value="mirror"', 1),
+        ('value="clamp"/>', 'value="clamp"/><boolean name="raw" value="true"/>|grey.png|colour.png', 1),
+        ('<rgb name="color0" value="0.7, 0.65, 0.5"/>', BITMAP.format("color0", ""), 1),
+    ],
+)  # fmt: skip
+def test_what_else_has_no_closed_form_is_seen_by_paths_beside_it(tmp_path, old, new, others):
+    """One thing is changed in each case."""
+    scene = loaded(tmp_path, changed(SCENE, old, new))
+    diffuse = build(mitsuba(), scene.spec).diffuse
+    assert len(diffuse.others) == others and len(diffuse.paints) + others == SCENE.count("<shape")
+    tracer = pair_tracer(scene, mono(8, 6))
+    assert tracer.has_bounced and not tracer.is_diffuse
+
+
+#: Things that are not diffuse: of smooth plastic, mirrored, of glass, and with holes.
+OTHERS = """
+  <shape type="sphere" id="gloss"><point name="center" x="0.12" y="-0.12" z="0.1"/><float name="radius" value="0.07"/>
+    <bsdf type="roughplastic"><float name="alpha" value="0.3"/></bsdf></shape>
+  <shape type="rectangle" id="mirror"><transform name="to_world">
+    <scale x="0.11" y="0.14"/><rotate y="1" angle="35"/><translate x="-0.28" y="-0.16" z="0.02"/></transform>
+    <bsdf type="twosided"><bsdf type="conductor"/></bsdf></shape>
+  <shape type="rectangle" id="veil"><transform name="to_world">
+    <scale x="0.12" y="0.06"/><translate x="0.1" y="0.28" z="0.09"/></transform>
+    <bsdf type="mask"><float name="opacity" value="0.6"/><bsdf type="twosided"><bsdf type="diffuse"/></bsdf></bsdf>
+  </shape>
+</scene>"""
+
+
+@pytest.mark.parametrize("depth", [2, 5])
+def test_gloss_and_what_bounces_are_seen_by_paths_beside_closed_forms(tmp_path, depth):
+    """Against Mitsuba's own path tracer. Light is sampled at what is glossy, and known at what is not."""
+    text = SCENE.replace("</scene>", OTHERS).replace('"max_depth" value="2"', f'"max_depth" value="{depth}"')
+    scene, sensor = loaded(tmp_path, text), hr.load_sensor("gen2").crop(60, 44, 1400, 1000)
+    tracer = pair_tracer(scene, sensor)
+    assert build(mitsuba(), scene.spec).diffuse.others == ["gloss", "mirror", "veil"]
+    assert tracer.has_bounced and not tracer.is_diffuse
+    assert_same(tracer, scene, sensor, rays=1024, most=20)
 
 
 def test_surfaces_that_were_made_before_are_seen_by_paths():
@@ -296,8 +342,8 @@ def test_a_direct_integrator_has_depth_2(tmp_path):
         SCENE.replace('value="2"/></int', 'value="8"/></int'),
     ):
         scene = loaded(tmp_path, text)
-        assert (build(mitsuba(), scene.spec).diffuse is None) == ('"8"' in text)
-    assert build(mitsuba(), hr.load_scene(tmp_path / "scene.yaml", {"max_depth": 2}).spec).diffuse is not None
+        assert pair_tracer(scene, mono(8, 6)).is_diffuse == ('"8"' not in text)
+    assert pair_tracer(hr.load_scene(tmp_path / "scene.yaml", {"max_depth": 2}), mono(8, 6)).is_diffuse
 
 
 def test_moving_shapes_have_the_wanted_error_in_the_default_mode(tmp_path, monkeypatch):

@@ -622,7 +622,12 @@ def test_decision_rays_of_a_plan_know_its_shadows():
     window, pixel = np.indices(shape)
     todo = (window + 2 * pixel) % 3 == 1
     what = SimpleNamespace(
-        rays=np.full(shape, 512), controlled=todo, wanted=1.5 + pixel, floor=0 * pixel, shadows=7 * window + pixel
+        rays=np.full(shape, 512),
+        controlled=todo,
+        wanted=1.5 + pixel,
+        floor=0 * pixel,
+        shadows=7 * window + pixel,
+        bounces=None,
     )
     own = SimpleNamespace(tracer=SimpleNamespace(rays=SimpleNamespace(is_box=True)), gain=None, tuning=TUNING)
     with mock.patch.object(adaptive, "about_edges", lambda *given, **more: calls.append(more)):

@@ -57,7 +57,7 @@ def test_statistics_of_the_rays_of_pairs(alike, mild):
         [from_host(types.Float, one), from_host(types.Float, other)],
         [from_host(types.Float, each) for each in before],
         from_host(types.UInt32, order.astype(np.uint32) * rays),
-        mild,
+        2 if mild else 0,
     )
     np.testing.assert_allclose(np.array(means[0]), third.mean(axis=1), rtol=1e-5)
     np.testing.assert_array_equal(np.array(met), bits.max(axis=1))

@@ -74,7 +74,8 @@ def test_changes_are_as_good_as_those_of_levels_from_a_part_of_the_rays(ball):
     before = source.rays_traced
     every = np.tile(pixel, 4), begin.ravel(), end.ravel()
     source.reference_flux(*every, 0.25, True)
-    assert rays < 0.6 * (source.rays_traced - before)
+    # closed forms make levels cheap as well
+    assert rays < 0.9 * (source.rays_traced - before)
 
 
 def test_all_windows_of_a_unit_have_one_number_of_rays(monkeypatch):
@@ -144,9 +145,12 @@ def planned(flux, scatter, change, unshadowed, quality=0.25):
     streams = []
 
     def seen(rows):
+        tables = flux[rows].ravel(), scatter[rows].ravel(), change[rows].ravel()
         return SimpleNamespace(
-            plain=flux[rows].ravel(), plain_scatter=scatter[rows].ravel(),
-            plain_change=change[rows].ravel(), unshadowed=unshadowed[rows].ravel(),
+            **dict(zip(("plain", "plain_scatter", "plain_change"), tables, strict=True)),
+            # where the other estimator scatters more, it decides nothing
+            controlled=2 * tables[0], controlled_scatter=1.5 * tables[1] + 1, controlled_change=3 * tables[2],
+            unshadowed=unshadowed[rows].ravel(), bounced_scatter=None,
         )  # fmt: skip
 
     def pilot_rays(pixel, window, windows, samples, footprint_px, stream):
@@ -168,7 +172,8 @@ def planned(flux, scatter, change, unshadowed, quality=0.25):
     end = np.repeat(ENDS_US[:, None], index.size, axis=1)
     got = References(renderer)._rays_of(index, end - 1, end, BASE, quality)
     assert set(streams) == {Stream.AUDIT_PILOT}
-    return got.T.tolist()
+    assert not got[2].any()
+    return got[:2].T.tolist()
 
 
 def test_the_window_that_needs_most_decides_how_many_rays_its_unit_gets():

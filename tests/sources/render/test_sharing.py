@@ -22,7 +22,7 @@ from hesim_render.sources.render.change_driven.pilot import Change, Pilot, Refin
 from hesim_render.sources.render.change_driven.plan import Plan
 from hesim_render.sources.render.change_driven.shared_tracer import SIDE, SharedTracer, Tiles
 from hesim_render.sources.render.change_driven.sharing import Sharing
-from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
+from hesim_render.sources.render.change_driven.tuning import TUNING
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.exact import RenderedFlux
 
@@ -436,8 +436,7 @@ def test_pixels_share_where_a_trial_says_so():
     noise = SimpleNamespace(
         lattice=lambda role: lattice, of=lambda role, index: lambda flux: 0 * flux + np.float32(4.0)
     )
-    gain_law = Gain(0.46, 0.56)
-    sharing, counts = Sharing(Tracer(), noise, 0.3, gain_law, TUNING), Counts()
+    sharing, counts = Sharing(Tracer(), noise, 0.3, TUNING), Counts()
     rays = np.full(40, 2048)
     # pixels of two tiles ask for too little
     rays[:4], rays[33:36] = 256, 64
@@ -474,7 +473,7 @@ def test_aimed_pairs_do_not_share():
     what = plan_of(np.full(8, 1024))
     what = replace(what, aims=SimpleNamespace(at=lambda window, site: SimpleNamespace(count=np.isin(site, aimed) * 3)))
     band = Band(np.arange(8), sites, None, False, 16, 0.3, False)
-    shared = Sharing(tracer, noise, 0.3, Gain(0.46, 0.56), TUNING).planned(what, band, Counts()).shared[0]
+    shared = Sharing(tracer, noise, 0.3, TUNING).planned(what, band, Counts()).shared[0]
     np.testing.assert_array_equal(shared, ~np.isin(np.arange(8), aimed))
 
 

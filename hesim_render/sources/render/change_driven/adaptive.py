@@ -68,7 +68,8 @@ class AdaptiveRenderer:
 
     def __init__(self, tracer: SharedTracer, noise: Noise, quality: float, tuning: Tuning, clock: MotionClock) -> None:
         self.tracer, self.noise, self.quality, self._clock = tracer, noise, quality, clock
-        self.gain = Gain(*(tuning.diffuse_gain if tracer.is_diffuse else tuning.path_gain))
+        has_closed_form = tracer.is_diffuse or tracer.has_bounced
+        self.gain = Gain(*(tuning.diffuse_gain if has_closed_form else tuning.path_gain))
         self.counts = Counts()
         self._sensor = tracer.sensor
         self.index = self._sensor.layout.full_index.ravel()
@@ -81,7 +82,7 @@ class AdaptiveRenderer:
             tuning = replace(tuning, pilot_rays=tuning.path_pilot_rays)
         self.tuning = tuning
         self.zoom = Zoom(tracer.view, tracer.camera, tracer.parts.groups, tuning, rays.can_aim, rays.blur_px)
-        self.sharing = Sharing(tracer, noise, quality, self.gain, tuning)
+        self.sharing = Sharing(tracer, noise, quality, tuning)
         self._kept: dict[Role, Still] = {}
 
     @property
@@ -186,7 +187,8 @@ class AdaptiveRenderer:
             what.rays[dark] = np.maximum(what.rays[dark], np.int16(self.tuning.dark_rays))
         if windows is not None and not (self.tracer.is_diffuse or self.has_ticks):
             before = self.tracer.rays_done
-            what = straightened(self.tracer, band.index, windows, what, self.tuning)
+            among = None if what.bounces is None else np.flatnonzero(what.bounces.any(axis=0))
+            what = straightened(self.tracer, band.index, windows, what, self.tuning, among)
             self.counts.rays += self.tracer.rays_done - before
         return what
 
@@ -309,7 +311,7 @@ class AdaptiveRenderer:
         tried = None if aims is None else aims.count == 0
         given = rays, what.controlled[todo], what.wanted[todo], what.floor[todo]
         known = None if fit is None else (what.fitted[todo], fit.at(todo[what.fitted]))
-        shadows = None if what.shadows is None else what.shadows[todo]
-        return about_edges(
-            *(self.tracer, pairs, *given, self.gain, self.tuning), tried=tried, known=known, shadows=shadows
-        )
+        shadows, gain = None if what.shadows is None else what.shadows[todo], self.gain
+        if what.bounces is not None:
+            gain = gain.or_other(Gain(*self.tuning.path_gain), what.bounces[todo])
+        return about_edges(*(self.tracer, pairs, *given, gain, self.tuning), tried=tried, known=known, shadows=shadows)

@@ -11,6 +11,34 @@ from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 _SMALLER = np.float32(1e-4)
 
 
+def gain_of(
+    bounced: NDArray[np.float32],
+    needed: NDArray[np.float32],
+    wanted: NDArray[np.float32],
+    gain: Gain,
+    tuning: Tuning,
+) -> tuple[Gain, NDArray[np.bool_]]:
+    """Error law of each pair, where paths find some light beside closed forms: that of paths, where the rays that the
+    other law asks for leave too large an error of what they find.
+
+    Parameters
+    ----------
+    bounced : [n], scatter of what paths find, e⁻/s.
+    needed : [n], scatter of all light over the wanted error.
+    wanted : [n], wanted error, e⁻/s.
+    gain : law of closed forms.
+    tuning : constants.
+
+    Returns
+    -------
+    The laws, and the pairs with that of paths, [n].
+    """
+    law_of_paths = Gain(*tuning.path_gain)
+    left = law_of_paths.error(bounced, np.maximum(gain.rays(needed), np.float32(tuning.least_rays)))
+    bounces = left > np.float32(tuning.bounced_part) * wanted
+    return gain.or_other(law_of_paths, bounces), bounces
+
+
 def allocate(
     pilot: Pilot,
     window: int,
@@ -20,7 +48,7 @@ def allocate(
     gain: Gain,
     tuning: Tuning,
     is_knot: bool,
-) -> tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.float32], NDArray[np.int16]]:
+) -> tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.float32], NDArray[np.int16], NDArray[np.bool_]]:
     """Allocate rays to each listed pixel in one window.
 
     Parameters
@@ -67,6 +95,13 @@ def allocate(
     # if a neighbour sees light that is occluded here, part of it may be visible here too
     is_light_near = sites.most(flux > np.float32(1e-6) * open_flux, REACH)
     brighter = np.maximum(sites.most(highest, 2) - value, np.where(is_light_near, open_flux[here] - value, 0))
+    # where paths find much beside closed forms, the law is that of paths
+    bounces = np.zeros(value.shape, np.bool_)
+    if pilot.bounced_scatter is not None:
+        square = (pilot.bounced_scatter[window] * _SMALLER) ** 2
+        bounced = np.sqrt(np.float32(0.5) * (square[here] + sites.mean(square))) / _SMALLER
+        needed = scatter / (np.float32(quality) * own)
+        gain, bounces = gain_of(bounced, needed, np.float32(quality) * own, gain, tuning)
     # rays for what the pilot may have missed: an edge that covers `unseen_area` of the pixel, or light beside it
     wanted_error = np.float32(quality) * own
     for_unseen = np.maximum(gain.rays(unseen / wanted_error), np.float32(tuning.bright_rays) * brighter / own)
@@ -89,4 +124,4 @@ def allocate(
     # to the nearest power of two, so that stratified sequences are used whole
     bits = np.rint(np.log2(np.clip(wanted, tuning.least_rays, tuning.most_rays))).astype(np.int16)
     rays = np.left_shift(np.int16(1), bits)
-    return rays, controlled, gain.error(scatter, rays), np.clip(floor, 0, tuning.most_rays).astype(np.int16)
+    return rays, controlled, gain.error(scatter, rays), np.clip(floor, 0, tuning.most_rays).astype(np.int16), bounces

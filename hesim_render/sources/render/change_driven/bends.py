@@ -27,6 +27,7 @@ def straightened(
     windows: Windows,
     what: Plan,
     tuning: Tuning,
+    among: NDArray[np.int64] | None = None,
 ) -> Plan:
     """A plan without the windows between which the flux of a pixel is a straight line.
 
@@ -37,6 +38,7 @@ def straightened(
     windows : the windows of the plan.
     what : plan of a whole block, so that no value depends on the end of a run.
     tuning : constants.
+    among : places of the pixels that are looked at; None for all.
     """
     last = what.rendered.shape[0] - 1
     # windows that are rendered by themselves, and may be left out: neither ends of the block nor small objects
@@ -45,7 +47,8 @@ def straightened(
     count = np.count_nonzero(marked, axis=0)
     rays = np.where(marked, what.rays, 0).sum(axis=0, dtype=np.int64)
     # where the looks at these and at both ends take a small part of the rays
-    place = np.flatnonzero((count > 1) & (rays >= tuning.bend_gain * tuning.bend_rays * (count + 2)))
+    asks = (count > 1) & (rays >= tuning.bend_gain * tuning.bend_rays * (count + 2))
+    place = np.flatnonzero(asks) if among is None else among[asks[among]]
     if place.size == 0:
         return what
     looks = marked[:, place]

@@ -16,7 +16,6 @@ from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges, 
 from hesim_render.sources.render.change_driven.packet_tracer import PACKET, PacketTracer, pair_of_rays
 from hesim_render.sources.render.change_driven.pair_flux import flux_inputs, remembered
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
-from hesim_render.sources.render.transport.diffuse import DiffuseIntegrator
 from hesim_render.sources.render.transport.occluded_lamps import most_frequent
 
 #: Rays that say which shapes hide lamps from a pair, and their repetition in the stream of the pilot, which has 0.
@@ -29,7 +28,7 @@ class DecisionRays(PacketTracer):
     @property
     def knows_shadows(self) -> bool:
         """True if there are shapes whose shadows have a closed form."""
-        return isinstance(self._integrator, DiffuseIntegrator) and self._integrator.knows_shadows
+        return self._direct is not None and self._direct.knows_shadows
 
     def edges(
         self,
@@ -96,7 +95,7 @@ class DecisionRays(PacketTracer):
         ----------
         pixel, window, windows, footprint_px, stream : see `pilot`.
         """
-        assert isinstance(self._integrator, DiffuseIntegrator)
+        assert self._direct is not None
         out, packets = np.zeros(pixel.size, np.uint32), np.full(pixel.size, _SHADOW_RAYS // PACKET)
         moments, key = self._moments(windows, None), self._key(stream)
         footprint = dr.opaque(jit().Float, footprint_px)
@@ -106,7 +105,7 @@ class DecisionRays(PacketTracer):
             own = packets[part]
             rays, _ = self._started(lanes, own, own * PACKET, moments, key, footprint, None)
             # codes of the shapes, [pair · ray]; the most frequent one among the rays of a pair counts
-            met = np.array(self._integrator.shadows_of(self._sampler, rays.ray, rays.now))
+            met = np.array(self._direct.shadows_of(self._sampler, rays.ray, rays.now))
             self._sampler.rest()
             out[part] = most_frequent(met.reshape(repeat.size, _SHADOW_RAYS))
             self._report(repeat.size * _SHADOW_RAYS)

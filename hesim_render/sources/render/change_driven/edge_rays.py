@@ -77,7 +77,7 @@ def about_edges(
     # more than were seen count on either side
     share = (fit.fewer + 2) / (fit.rays + 4)
     between = np.where(is_edge, 0, np.sqrt(share * (1 - share)) * contrast)
-    by_scatter = gain.rays(between + fit.scatter / wanted)
+    by_scatter = gain.at(place).rays(between + fit.scatter / wanted)
     # what moves within the window passes by more of the decision rays than a sliver that rests, so these tell enough
     is_flat = ~is_edge & ((contrast < tuning.low_contrast) | moves)
     # an edge: its contrast says how much a ray weighs that finds the model wrong; half of the rays start in the strip

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hesim_render.sources.render.change_driven.change_detector import Wanted, least_change
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
-from hesim_render.sources.render.change_driven.pair_flux import CHANGES, STATISTICS, PilotFlux
+from hesim_render.sources.render.change_driven.pair_flux import CHANGES, PilotFlux
 from hesim_render.sources.render.change_driven.sample_instants import STEP_PX
 
 
@@ -24,7 +24,7 @@ class Looks:
 
     Attributes
     ----------
-    tables : [window, site] each, by the names in `STATISTICS` and `CHANGES`, e⁻/s.
+    tables : [window, site] each, by the names of `PilotFlux.statistics` and `CHANGES`, e⁻/s.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class Looks:
         trace: Callable[[NDArray[np.int64], NDArray[np.int64]], PilotFlux],
     ) -> None:
         self._trace, self._last, self._near, self._place = trace, count - 1, near, np.flatnonzero(near)
-        self.tables = {name: np.repeat(getattr(first, name)[None], count, axis=0) for name in STATISTICS}
+        self.tables = {name: np.repeat(getattr(first, name)[None], count, axis=0) for name in first.statistics}
         for name in CHANGES:
             self.tables[name] = np.zeros((count, near.size), np.float32)
             # where nothing is near, the last window has the difference of the first one to the anchor
@@ -61,7 +61,7 @@ class Looks:
 
     def put(self, window: int, seen: PilotFlux) -> None:
         """Put in what all sites show in a window; their changes stay."""
-        for name in STATISTICS:
+        for name in seen.statistics:
             self.tables[name][window] = getattr(seen, name)
 
     def wherever(self, marked: NDArray[np.bool_]) -> None:

@@ -69,11 +69,13 @@ class _Traced:
     ----------
     fluxes : the integrator's three fluxes, weighted, e⁻/s on the optical axis, and 1 where the ray met the box of a
         moving object, else 0.
+    bounced : the part that paths find beside closed forms, weighted, e⁻/s on the optical axis; None if there is none.
     place : of its start, px from the centre of its pixel.
     share : of the window, at which it starts.
     """
 
     fluxes: tuple[Float, Float, Float, UInt32]
+    bounced: Float | None
     place: tuple[Float, Float]
     share: Float
 
@@ -102,6 +104,7 @@ class PacketTracer(Tracer):
     Attributes
     ----------
     traces : number of traces started so far.
+    paths : traces light that has no closed form; None if all has.
 
     Raises
     ------
@@ -125,14 +128,18 @@ class PacketTracer(Tracer):
         types, self._seed, self._light = jit(), seed, light
         self.rays.require_one_path()
         self.parts = MovingScene(self.built)
-        self._integrator: DiffuseIntegrator | PathIntegrator
-        if self.built.diffuse is not None:
-            self._integrator = DiffuseIntegrator(self.parts, self.built.diffuse, self.sensor.responses)
+        (depth, roulette), diffuse = path_depths(self.built.integrator), self.built.diffuse
+        self.paths: PathIntegrator | None = None
+        self._direct: DiffuseIntegrator | None = None
+        if diffuse is None or diffuse.others or depth != 2:
+            self.paths = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))
+        if diffuse is not None:
+            self._direct = DiffuseIntegrator(self.parts, diffuse, self.sensor.responses, self.paths)
             # the integrator has what it needs of the pictures, which are large
             self.built.diffuse = None
-        else:
-            depth, roulette = path_depths(self.built.integrator)
-            self._integrator = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))
+        integrator = self._direct or self.paths
+        assert integrator is not None
+        self._integrator = integrator
         self._aim = Aim(self.parts, self.rays)
         self._boxes = method_cache(self.parts.box_rows_in, maxsize=8)
         layout = self.sensor.layout
@@ -144,17 +151,22 @@ class PacketTracer(Tracer):
     @property
     def is_diffuse(self) -> bool:
         """True if all visible light is direct light on diffuse surfaces."""
-        return isinstance(self._integrator, DiffuseIntegrator)
+        return self.paths is None
+
+    @property
+    def has_bounced(self) -> bool:
+        """True if some light is seen in closed form, and some by paths."""
+        return self.paths is not None and self._direct is not None
 
     @property
     def is_plain(self) -> bool:
         """True if all visible light is direct light on diffuse surfaces without pictures."""
-        return isinstance(self._integrator, DiffuseIntegrator) and not self._integrator.has_pictures
+        return self.paths is None and self._direct is not None and not self._direct.has_pictures
 
     @property
     def moves_outlines(self) -> bool:
         """True if the same rays, which meet nothing that moves, may bring another flux at another time."""
-        return isinstance(self._integrator, DiffuseIntegrator) and self._integrator.moves_outlines
+        return self._direct is not None and self._direct.moves_outlines
 
     def moves_within(self, windows: Windows) -> bool:
         """True if edges may move by more than a small part of a pixel within a window."""
@@ -215,15 +227,16 @@ class PacketTracer(Tracer):
         types, now = jit(), rays.now
         occluders = () if shadows is None else (spread_out(types.UInt32, shadows, pair),)
         dr.eval(*occluders)
-        *fluxes, met = self._integrator.flux(self._sampler, rays.ray, now, rays.filter, *occluders)
+        *fluxes, bounced, met = self._integrator.flux(self._sampler, rays.ray, now, rays.filter, *occluders)
         bits = dr.select(met, types.UInt32(1), dr.zeros(types.UInt32, int(packets.sum()) * PACKET))
-        dr.eval(fluxes, bits)
+        dr.eval(fluxes, bounced, bits)
         self._sampler.rest()
         if rays.weight is not None and is_weighted:
             model = 0 if rays.model is None else rays.model
             fluxes = [(flux - model) * rays.weight for flux in fluxes]
-            dr.eval(fluxes)
-        return _Traced((fluxes[0], fluxes[1], fluxes[2], bits), rays.place, rays.share)
+            bounced = None if bounced is None else bounced * rays.weight
+            dr.eval(fluxes, bounced)
+        return _Traced((fluxes[0], fluxes[1], fluxes[2], bits), bounced, rays.place, rays.share)
 
     def _started(
         self,

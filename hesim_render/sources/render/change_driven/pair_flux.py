@@ -18,6 +18,7 @@ from hesim_render.sources.render.change_driven.windows import Windows
 
 #: What a pair shows, by `PilotFlux`, and how its rays differ from the same rays in another window.
 STATISTICS = ("controlled", "plain", "controlled_scatter", "plain_scatter", "unshadowed")
+BOUNCED = "bounced_scatter"
 CHANGES = ("controlled_change", "plain_change")
 
 
@@ -95,6 +96,7 @@ class PilotFlux:
     met : see `PairFlux`.
     controlled_change, plain_change : standard deviation of the difference of single rays to the same rays in another
         window, e⁻/s, float32; 0 where there is none to compare with.
+    bounced_scatter : scatter, never mild, of what paths find beside closed forms, e⁻/s, float32; None for nothing.
     """
 
     controlled: NDArray[np.float32]
@@ -105,25 +107,37 @@ class PilotFlux:
     met: NDArray[np.bool_]
     controlled_change: NDArray[np.float32]
     plain_change: NDArray[np.float32]
+    bounced_scatter: NDArray[np.float32] | None = None
 
     @classmethod
-    def empty(cls, count: int) -> "PilotFlux":
+    def empty(cls, count: int, has_bounced: bool = False) -> "PilotFlux":
         """Statistics to be filled in."""
         controlled, plain, unshadowed, *others = (np.zeros(count, np.float32) for _ in range(7))
-        return cls(controlled, plain, unshadowed, others[0], others[1], np.zeros(count, np.bool_), others[2], others[3])
+        bounced, met = np.zeros(count, np.float32) if has_bounced else None, np.zeros(count, np.bool_)
+        return cls(controlled, plain, unshadowed, others[0], others[1], met, others[2], others[3], bounced)
+
+    @property
+    def statistics(self) -> tuple[str, ...]:
+        """Names of what a pair shows."""
+        return STATISTICS if self.bounced_scatter is None else (*STATISTICS, BOUNCED)
+
+    @property
+    def tables(self) -> dict[str, NDArray]:
+        """All values by name."""
+        return {each.name: values for each in fields(self) if (values := getattr(self, each.name)) is not None}
 
     def with_means(self, place: NDArray[np.int64], others: "PilotFlux", chosen: NDArray[np.bool_]) -> "PilotFlux":
         """The same, but for what some pairs show, which is that of those that are `chosen` among others; changes and
         `met` stay.
         """
-        tables = {name: getattr(self, name).copy() for name in STATISTICS}
+        tables = {name: getattr(self, name).copy() for name in self.statistics}
         for name, values in tables.items():
             values[place] = getattr(others, name)[chosen]
         return replace(self, **tables)
 
     def with_pairs(self, place: NDArray[np.int64], others: "PilotFlux") -> "PilotFlux":
         """The same, but for some pairs, which show what others do."""
-        tables = {each.name: getattr(self, each.name).copy() for each in fields(self)}
+        tables = {name: values.copy() for name, values in self.tables.items()}
         for name, values in tables.items():
             values[place] = getattr(others, name)
         return PilotFlux(**tables)
@@ -139,6 +153,7 @@ class PilotFlux:
         alike: int,
         before: "tuple[PilotRays, NDArray[np.integer]] | None" = None,
         mild: bool = False,
+        bounced: Float | None = None,
     ) -> None:
         """Put in the statistics of pairs.
 
@@ -152,9 +167,10 @@ class PilotFlux:
         before : the same rays in other windows, and [n] the pair among them to compare each pair with; None where there
             is none.
         mild : take the mild scatter.
+        bounced : of each ray, what paths find beside closed forms; None if there is nothing.
         """
         types, rays = jit(), RayStatistics(len(met) // samples, samples, alike)
-        dr.eval(controlled, plain, unshadowed, met)
+        dr.eval(controlled, plain, unshadowed, met, bounced)
         # place of the first ray of each pair among the rays to compare with
         others: tuple[Float, ...] = ()
         first = None
@@ -162,10 +178,13 @@ class PilotFlux:
             others = before[0].controlled, before[0].plain
             first = from_host(types.UInt32, before[1]) * dr.opaque(types.UInt32, samples)
         # both estimators from the same rays; the plan chooses by their scatter
-        means, bits, both, changes = rays.of([unshadowed], met, [controlled, plain], others, first, mild)
+        estimates = [controlled, plain] if bounced is None else [controlled, plain, bounced]
+        means, bits, scattered, changes = rays.of([unshadowed], met, estimates, others, first, 2 if mild else 0)
         results: dict[str, Float | UInt32] = {"unshadowed": means[0], "met": bits}
-        for name, (mean, scatter) in zip(("controlled", "plain"), both, strict=True):
+        for name, (mean, scatter) in zip(("controlled", "plain"), scattered, strict=False):
             results[name], results[f"{name}_scatter"] = mean, scatter
+        if bounced is not None:
+            results[BOUNCED] = scattered[2][1]
         results.update(zip(CHANGES, changes, strict=False))
         dr.eval(*results.values())
         for name, each in results.items():
@@ -226,7 +245,7 @@ def remembered(
     if journal is None:
         trace()
         return
-    every = [getattr(out, each.name) for each in fields(out)]
+    every = list(out.tables.values()) if isinstance(out, PilotFlux) else [getattr(out, f.name) for f in fields(out)]
     key, kept = key_of(*inputs), [values[part].copy() for values in every]
     if journal.recall(key, kept):
         for values, known in zip(every, kept, strict=True):

@@ -1,7 +1,6 @@
 """Flux of (pixel, time window) pairs in any order. Each ray has its own instant inside the window of its pixel."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 from functools import partial
 
 import numpy as np
@@ -132,7 +131,7 @@ class PairTracer(DecisionRays):
         -------
         Statistics of the pairs, [n].
         """
-        out, packets = PilotFlux.empty(pixel.size), np.full(pixel.size, samples // PACKET)
+        out, packets = PilotFlux.empty(pixel.size, self.has_bounced), np.full(pixel.size, samples // PACKET)
         moments, key = self._moments(windows, span_us), self._key(stream)
         footprint = dr.opaque(jit().Float, footprint_px)
         for part, aimed, known in in_blocks(packets, self._block_rays // PACKET, aims, None, shadows):
@@ -155,9 +154,9 @@ class PairTracer(DecisionRays):
             remembered(self._journal if kept is None else None, self._run_part + inputs, out, part, trace)
             self._report(lanes[0].size * samples)
         scale = self.axis_factor(pixel)
-        for each in fields(out):
-            if each.name != "met":
-                getattr(out, each.name)[:] *= scale
+        for name, values in out.tables.items():
+            if name != "met":
+                values[:] *= scale
         return out
 
     def pilot_rays(
@@ -220,9 +219,10 @@ class PairTracer(DecisionRays):
         packets = np.full(lanes[0].size, samples // PACKET)
         # all rays belong to the first half
         given = lanes, packets, packets * PACKET, moments, key, footprint, aims
-        traced = self._packets_of(*given, shadows=shadows).fluxes
+        of_rays = self._packets_of(*given, shadows=shadows)
+        traced, alike = of_rays.fluxes, samples if aims is None else samples // 2
         # rays that are aimed are a kind of their own: their mean differs from that of the others
-        out.put(part, *traced, samples, samples if aims is None else samples // 2, before, mild)
+        out.put(part, *traced, samples, alike, before, mild, of_rays.bounced)
         if kept is not None and isinstance(part, slice):
             types = jit()
             place = dr.opaque(types.UInt32, part.start * samples) + dr.arange(types.UInt32, len(traced[0]))

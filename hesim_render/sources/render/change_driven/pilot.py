@@ -23,7 +23,14 @@ from hesim_render.sources.render.change_driven.deep_shadow import DeepShadow
 from hesim_render.sources.render.change_driven.known_shadows import with_known_shadows
 from hesim_render.sources.render.change_driven.looks import Looks
 from hesim_render.sources.render.change_driven.neighbours import Sites
-from hesim_render.sources.render.change_driven.pair_flux import CHANGES, STATISTICS, PilotFlux, PilotRays, joined
+from hesim_render.sources.render.change_driven.pair_flux import (
+    BOUNCED,
+    CHANGES,
+    STATISTICS,
+    PilotFlux,
+    PilotRays,
+    joined,
+)
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.small_objects import Look
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -105,6 +112,7 @@ class Pilot:
     all_move : True if the camera moves, and with it every edge in the image.
     deep : sites in deep shadow; None if there are none.
     shadows : [window, site], known shadows, see `PairTracer.trace`; None if there are none.
+    bounced_scatter : scatter of what paths find beside closed forms, e⁻/s; None if there is nothing.
     """
 
     controlled: NDArray[np.float32]
@@ -118,6 +126,7 @@ class Pilot:
     all_move: bool = False
     deep: DeepShadow | None = None
     shadows: NDArray[np.uint32] | None = None
+    bounced_scatter: NDArray[np.float32] | None = None
 
     @property
     def windows(self) -> int:
@@ -244,7 +253,7 @@ def take_pilot(
         looks.compare_end(np.flatnonzero(~near))
     # statistics of all windows, [window, site]
     tables = [looks.tables[name] for name in STATISTICS]
-    pilot = Pilot(tables[0], tables[1], tables[2], tables[3], tables[4])
+    pilot = Pilot(tables[0], tables[1], tables[2], tables[3], tables[4], bounced_scatter=looks.tables.get(BOUNCED))
     change = None
     if anchored is not None and ending is not None:
         # inner windows against the first one, the last and the first against their anchors
@@ -304,8 +313,8 @@ def _refine(
         )
         # these rays see better than the pilot; those of small objects that are not aimed only tell of more scatter
         if is_aimed or not is_small:
-            for values, new in zip(_tables(pilot), _tables(refined), strict=True):
-                values[window, place] = new
+            for name in refined.statistics:
+                getattr(pilot, name)[window, place] = getattr(refined, name)
         if not is_small:
             continue
         # scatter of small objects, sorted by window
@@ -316,7 +325,3 @@ def _refine(
                 Refinement(place[own], counts, refined.controlled_scatter[own], refined.plain_scatter[own])
             )
     return [Refinement(*map(np.concatenate, zip(*map(astuple, each), strict=True))) for each in parts]
-
-
-def _tables(statistics: Pilot | PilotFlux) -> tuple[NDArray[np.float32], ...]:
-    return tuple(getattr(statistics, name) for name in STATISTICS)

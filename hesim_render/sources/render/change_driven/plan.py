@@ -78,6 +78,7 @@ class Plan:
     aims : small objects at which rays are aimed, by window and site; None if there are none.
     shadows : [window, pixel], known shadows, see `PairTracer.trace`; None if there are none.
     shared : pairs that share with those around, see `Sharing`; None if none do.
+    bounces : pairs that follow the law of paths; None if all have the same law.
     """
 
     rendered: NDArray[np.bool_]
@@ -94,6 +95,7 @@ class Plan:
     aims: Aims | None = None
     shadows: NDArray[np.uint32] | None = None
     shared: NDArray[np.bool_] | None = None
+    bounces: NDArray[np.bool_] | None = None
 
     def until(self, window: int) -> "Plan":
         """The plan without the pairs on which no value up to a window depends.
@@ -124,7 +126,8 @@ class Plan:
         names = "rendered", "rays", "controlled", "error", "wanted", "floor", "fitted", "barred", "asked", "pilot"
         first = {name: getattr(self, name)[:1] for name in names}
         shadows = None if self.shadows is None else self.shadows[:1]
-        return replace(self, differences=self.differences.first(), shadows=shadows, **first)
+        bounces = None if self.bounces is None else self.bounces[:1]
+        return replace(self, differences=self.differences.first(), shadows=shadows, bounces=bounces, **first)
 
 
 def plan(
@@ -174,6 +177,7 @@ def plan(
         pilot.steady_flux[:, sites.listed],
         pilot.aims,
         None if pilot.shadows is None else pilot.shadows[:, sites.listed],
+        bounces=None if pilot.bounced_scatter is None else np.zeros(shape, np.bool_),
     )
     if last > 1:
         _choose_windows(out, pilot, sites, units, quality, tuning, follows)
@@ -181,7 +185,11 @@ def plan(
     for window, some in enumerate(map(np.flatnonzero, out.rendered)):
         at_end = is_knot and window in (0, last)
         part = allocate(pilot, window, sites.only(some), units, quality, gain, tuning, at_end)
-        out.rays[window, some], out.controlled[window, some], out.error[window, some], out.floor[window, some] = part
+        out.rays[window, some], out.controlled[window, some], out.error[window, some], out.floor[window, some] = part[
+            :4
+        ]
+        if out.bounces is not None:
+            out.bounces[window, some] = part[4]
     # where little changes, few rays of a difference do what many rays of the pair alone would
     chosen = differences(pilot, sites, units, quality, out.rendered, out.rays, tuning, out.error, shares)
     if follows and last > 1:

@@ -50,7 +50,7 @@ class RayStatistics:
         estimates: Sequence[Float],
         others: Sequence[Float] = (),
         first_other: UInt32 | None = None,
-        mild: bool = False,
+        mild: int = 0,
     ) -> tuple[list[Float], UInt32, list[tuple[Float, Float]], list[Float]]:
         """All statistics of the rays of pairs, in three passes over the rays.
 
@@ -63,9 +63,9 @@ class RayStatistics:
         means : values of all rays in memory, [n · samples], of which means are wanted.
         bits : of all rays.
         estimates : values of all rays, of which mean and scatter are wanted.
-        others, first_other : for each of `estimates`, the same rays in another window, and place of the first one of
-            each pair among them; empty where there are none.
-        mild : take the mild scatter.
+        others, first_other : for the first of `estimates`, the same rays in another window, and place of the first one
+            of each pair among them; empty where there are none.
+        mild : number of estimates, from the first one on, whose scatter is the mild one.
 
         Returns
         -------
@@ -76,7 +76,7 @@ class RayStatistics:
             rays of a pair have in common drops out.
         """
         types, count = jit(), len(estimates)
-        compared = list(zip(estimates, others, strict=True)) if others else []
+        compared = list(zip(estimates, others, strict=False))
         early_late = slice(len(means) + 1, len(means) + 1 + 2 * count)
 
         def difference(values: Float, other: Float, ray: UInt32) -> Float:
@@ -123,10 +123,10 @@ class RayStatistics:
 
         powers = self._over_rays(add_powers, [types.Float] * (size + count))
         # the choice is no part of the kernel, so that one serves both
-        is_mild, scattered = dr.opaque(types.Bool, mild), []
+        is_mild, scattered = [dr.opaque(types.Bool, k < mild) for k in range(count)], []
         for k in range(count):
             second, fourth = powers[k], powers[size + k]
-            square = dr.select(is_mild, dr.sqrt(fourth * self._share), dr.select(second > 0, fourth / second, 0))
+            square = dr.select(is_mild[k], dr.sqrt(fourth * self._share), dr.select(second > 0, fourth / second, 0))
             mean = (both[2 * k] + both[2 * k + 1]) * self._share
             scattered.append((mean, units[k] * dr.sqrt(square * self._unbiased)))
         spread = [

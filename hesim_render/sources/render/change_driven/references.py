@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hesim_render.core.distinct import distinct_columns
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
+from hesim_render.sources.render.change_driven.allocation import gain_of
 from hesim_render.sources.render.change_driven.error_target import Role
 from hesim_render.sources.render.change_driven.retrace import KnownPairs, aims_of, traced_again, traced_repeatedly
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -105,15 +106,15 @@ class References:
         end_us: NDArray[np.float64],
         rays: NDArray[np.float64],
         times: NDArray[np.float64],
+        controlled: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Flux of pairs [n] by numbers of rays, and half the difference of its halves, [2, n]."""
-        pairs = np.stack([index.astype(np.float64), begin_us, end_us, rays, times])
+        """Flux of pairs [n] by numbers of rays and an estimator, and half the difference of its halves, [2, n]."""
+        pairs = np.stack([index.astype(np.float64), begin_us, end_us, rays, times, controlled])
 
         def traced(new: NDArray[np.int64]) -> NDArray[np.float64]:
             span, which = distinct_columns(pairs[1:3, new])
             own = index[new], which, Windows(span[0], span[1]), rays[new].astype(np.int64)
-            is_controlled = np.zeros(which.size, np.bool_)
-            return traced_repeatedly(self._renderer.tracer, own, is_controlled, times[new].astype(np.int64))
+            return traced_repeatedly(self._renderer.tracer, own, controlled[new] > 0, times[new].astype(np.int64))
 
         return self._changes.values(pairs, traced)
 
@@ -125,7 +126,9 @@ class References:
         base: int,
         quality: float,
     ) -> NDArray[np.float64]:
-        """Rays of each unit, the same in all its windows: a power of two, and how often they are traced, [2, unit]."""
+        """Rays of each unit, the same in all its windows: a power of two, how often they are traced, and whether by the
+        estimator with a control variate, [3, unit].
+        """
         asked = np.stack([index.astype(np.float64), begin_us[base], begin_us[0], end_us[-1], 0 * end_us[0] + quality])
 
         def planned(new: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -151,14 +154,26 @@ class References:
         first, kept = tracer.pilot_rays(index, window[base], *given, stream=Stream.AUDIT_PILOT)
         every, place = np.tile(index, shape[0]), np.tile(np.arange(index.size), shape[0])
         seen = tracer.pilot(every, window.ravel(), *given, Stream.AUDIT_PILOT, before=(kept, place))
-        flux, scatter, change = (each.reshape(shape) for each in (seen.plain, seen.plain_scatter, seen.plain_change))
+        # one estimator for all windows of a unit, so that a difference is one of the scene
+        chosen = first.controlled_scatter <= first.plain_scatter
+        flux, scatter, change = (
+            np.where(chosen, *(getattr(seen, f"{name}{what}").reshape(shape) for name in ("controlled", "plain")))
+            for what in ("", "_scatter", "_change")
+        )
+        base_flux, base_scatter = (
+            np.where(chosen, *(getattr(first, f"{name}{what}") for name in ("controlled", "plain")))
+            for what in ("", "_scatter")
+        )
         wanted_error = np.float32(quality) * renderer.noise.of("events", index)(flux)
         # a change of ln x by rays in both windows: f_w/F_w − f_b/F_b = (f_w − f_b)/F_w + f_b·(1/F_w − 1/F_b),
         # where the second part is what both have in common, if the flux itself has changed
-        moved = np.abs(flux - first.plain) / np.where(first.plain > 0, first.plain, np.inf)
-        single = change + first.plain_scatter * moved
+        moved = np.abs(flux - base_flux) / np.where(base_flux > 0, base_flux, np.inf)
+        single = change + base_scatter * moved
         by_change = (np.float32(tuning.difference_factor) * single / wanted_error) ** 2
-        by_level = renderer.gain.rays(scatter / np.maximum(_LEVEL_ERROR * flux, wanted_error))
+        level_error, gain = np.maximum(_LEVEL_ERROR * flux, wanted_error), renderer.gain
+        if seen.bounced_scatter is not None:
+            gain, _ = gain_of(seen.bounced_scatter.reshape(shape), scatter / level_error, level_error, gain, tuning)
+        by_level = gain.rays(scatter / level_error)
         # no ray may weigh too much
         by_weight = seen.unshadowed.reshape(shape) / (np.float32(tuning.audit_ray_weight) * wanted_error)
         # the window that needs most decides for all of them
@@ -166,4 +181,4 @@ class References:
         bits = np.ceil(np.log2(np.clip(wanted, tuning.least_audit_rays, tuning.most_rays)))
         # where the largest number of rays does not do, they are traced several times
         times = np.clip(np.ceil(by_change.max(axis=0) / tuning.most_rays), 1, tuning.most_audit_times)
-        return np.stack([2.0**bits, times.astype(np.float64)])
+        return np.stack([2.0**bits, times.astype(np.float64), chosen.astype(np.float64)])

@@ -1,7 +1,6 @@
 """Reference values of the audit: pairs traced again, with a stream of random numbers of their own."""
 
 from collections.abc import Callable
-from dataclasses import astuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 from hesim_render.core.distinct import distinct_columns
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.aim import Aims, PairAims
+from hesim_render.sources.render.change_driven.allocation import gain_of
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
 from hesim_render.sources.render.change_driven.edges import PairEdges
 from hesim_render.sources.render.change_driven.error_target import NoiseUnit
@@ -133,7 +133,10 @@ def traced_again(
     scatter = np.where(controlled, pilot.controlled_scatter, pilot.plain_scatter)
     # rays for the wanted error of the scatter, and so many that no ray weighs too much
     wanted_error = wanted_of(flux)
-    by_scatter = gain.rays((scatter / wanted_error).astype(np.float32))
+    needed = (scatter / wanted_error).astype(np.float32)
+    if pilot.bounced_scatter is not None:
+        gain = gain_of(pilot.bounced_scatter, needed, wanted_error, gain, tuning)[0]
+    by_scatter = gain.rays(needed)
     by_weight = pilot.unshadowed / (np.float32(tuning.audit_ray_weight) * wanted_error)
     # powers of two, of the weight of a ray the nearest one
     wanted = np.maximum(np.ceil(np.log2(np.maximum(by_scatter, 1))), np.rint(np.log2(np.maximum(by_weight, 1))))
@@ -214,4 +217,4 @@ def _pilot(
     for some, own in ((kinds[0], None), (kinds[1], aims.part(kinds[1]))):
         parts.append(tracer.pilot(pixel[some], window[some], windows, rays, 1.0, Stream.AUDIT_PILOT, aims=own))
     order = np.argsort(np.concatenate(kinds))
-    return PilotFlux(*(np.concatenate(values)[order] for values in zip(*map(astuple, parts), strict=True)))
+    return PilotFlux(**{name: np.concatenate([part.tables[name] for part in parts])[order] for name in parts[0].tables})

@@ -22,7 +22,6 @@ from hesim_render.sources.render.change_driven.packet_tracer import PACKET, pair
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, flux_inputs, remembered
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
-from hesim_render.sources.render.transport.paths import PathIntegrator
 from hesim_render.sources.render.transport.shared_paths import Groups, SharedPaths
 
 #: Rows and columns of a tile, pixels of a lattice.
@@ -72,10 +71,9 @@ class SharedTracer(PairTracer):
 
     def may_share(self, lattice: Lattice | None) -> bool:
         """True if the pixels of a lattice may share: they have one filter, and see paths of more than two segments."""
-        paths = self._integrator
-        if lattice is None or min(lattice.rows, lattice.cols) < SIDE or not isinstance(paths, PathIntegrator):
+        if lattice is None or min(lattice.rows, lattice.cols) < SIDE or self.paths is None:
             return False
-        return paths.may_share and self._has_one_filter(lattice)
+        return self.paths.may_share and self._has_one_filter(lattice)
 
     def trial(self, tile: NDArray[np.int64], lattice: Lattice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """What all pixels of some tiles of a lattice show with `TRIAL_RAYS` rays, with sharing and without.
@@ -184,7 +182,7 @@ class SharedTracer(PairTracer):
         part: slice,
     ) -> None:
         """Flux of all pixels of some tiles, each with some packets of rays."""
-        assert isinstance(self._integrator, PathIntegrator)
+        assert self.paths is not None
         self.traces += 1
         types, rays_of_pair = jit(), packets * PACKET
         pair = pair_of_rays(packets)
@@ -192,7 +190,7 @@ class SharedTracer(PairTracer):
         dr.eval(groups.own, groups.first, groups.stride)
         footprint = dr.opaque(types.Float, 1.0)
         rays, _ = self._started(lanes, packets, rays_of_pair // 2, moments, key, footprint, None, groups)
-        *fluxes, met = SharedPaths(self._integrator).flux(self._sampler, rays.ray, rays.now, rays.filter, groups)
+        *fluxes, met = SharedPaths(self.paths).flux(self._sampler, rays.ray, rays.now, rays.filter, groups)
         bits = dr.select(met, types.UInt32(1), dr.zeros(types.UInt32, int(rays_of_pair.sum())))
         dr.eval(fluxes, bits)
         self._sampler.rest()

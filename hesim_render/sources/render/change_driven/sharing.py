@@ -23,7 +23,6 @@ class Sharing:
     ----------
     tracer : traces tiles.
     noise, quality : noise of the sensor, and the wanted error over it.
-    gain : error law of stratified rays.
     tuning : constants.
 
     Attributes
@@ -31,10 +30,12 @@ class Sharing:
     lattice : the event pixels; None if nothing is shared.
     """
 
-    def __init__(self, tracer: SharedTracer, noise: Noise, quality: float, gain: Gain, tuning: Tuning) -> None:
+    def __init__(self, tracer: SharedTracer, noise: Noise, quality: float, tuning: Tuning) -> None:
         lattice = None if tracer.sensor.spec.evs is None else noise.lattice("events")
         self.lattice = lattice if tracer.may_share(lattice) else None
-        self._tracer, self._noise, self._quality, self._gain, self._tuning = tracer, noise, quality, gain, tuning
+        self._tracer, self._noise, self._quality, self._tuning = tracer, noise, quality, tuning
+        #: Error law of paths.
+        self._gain = Gain(*tuning.path_gain)
         #: Number of rays, 0 where sharing does not pay, and expected error of the tiles that were asked for, e⁻/s.
         self._known: dict[int, tuple[int, float]] = {}
 

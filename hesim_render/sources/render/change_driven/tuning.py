@@ -89,6 +89,10 @@ class Tuning:
     diffuse_gain, path_gain : (factor, power), no unit, F. The standard error of n stratified rays is factor · n^-power
         times the scatter, for direct light on diffuse surfaces and for paths. Without (1, 0.5): the plan assumes
         independent rays and spends several times as many.
+    bounced_part : wanted errors, F. From `rotating-star` and `camera-sweep` with a ball of plastic, `room` and
+        `floor-ball` of `benchmarks/scenes`: where the law of closed forms leaves a larger error of what paths find
+        beside them, the law is that of paths. Without (0): every pixel to which light bounces takes the rays of a path
+        tracer.
     frame_margin : factor, H. The wanted error of an exposure is divided by this. Without (1): the error is too large
         where much moves within the exposure, because rays gain less there than the fit says.
     unseen_area : part of a pixel, F. Area in which the pilot may have missed what the neighbours show. Without (0): an
@@ -181,6 +185,7 @@ class Tuning:
     most_fine_rays: int = 16384
     diffuse_gain: tuple[float, float] = (0.68, 0.70)
     path_gain: tuple[float, float] = (0.46, 0.56)
+    bounced_part: float = 0.5
     frame_margin: float = 1.5
     unseen_area: float = 1 / 32
     most_unseen_rays: int = 512
@@ -222,15 +227,27 @@ class Gain:
 
     Parameters
     ----------
-    factor, power : constants of the law, no unit.
+    factor, power : constants of the law, no unit; of all pairs, or of each, [n].
     """
 
-    factor: float
-    power: float
+    factor: float | NDArray[np.float32]
+    power: float | NDArray[np.float32]
+
+    def or_other(self, other: "Gain", where: NDArray[np.bool_]) -> "Gain":
+        """This law, or another one where it holds; one for each pair."""
+        both = (self.factor, other.factor), (self.power, other.power)
+        return Gain(*(np.where(where, theirs, own).astype(np.float32) for own, theirs in both))
+
+    def at(self, place: NDArray[np.int64]) -> "Gain":
+        """The laws of some pairs."""
+        factor, power = self.factor, self.power
+        if isinstance(factor, float) or isinstance(power, float):
+            return self
+        return Gain(factor[place], power[place])
 
     def error(self, scatter: NDArray[np.float32], rays: NDArray[np.integer]) -> NDArray[np.float32]:
         """Expected standard error, in the unit of `scatter`."""
-        return np.float32(self.factor) * scatter * rays.astype(np.float32) ** np.float32(-self.power)
+        return np.float32(self.factor) * scatter * rays.astype(np.float32) ** (-np.float32(self.power))
 
     def rays(self, scatter_over_error: NDArray[np.float32]) -> NDArray[np.float32]:
         """Number of rays that reaches a wanted error, from the scatter over that error; not yet rounded to a power

@@ -63,8 +63,8 @@ class BuiltScene:
     groups : movable shapes by name: ``target``, an object's name, a Mitsuba shape id.
     trajectories : tracks of the groups that really move.
     is_dark : True where nothing emits.
-    diffuse : surfaces and lights, if all surfaces are diffuse, the light is direct, and that of all lights has a closed
-        form; otherwise None. What traces the scene takes it, because pictures in it are large.
+    diffuse : diffuse surfaces and lights, if the direct light of all lights has a closed form; otherwise None. What
+        traces the scene takes it, because pictures in it are large.
     exact_because : why the scene needs the exact mode; None if it does not.
     camera : the Mitsuba scene's own camera, if it is used.
     integrator_plugin : plugin description of a Mitsuba scene's integrator; None if it was given as an object.
@@ -187,7 +187,7 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
         groups=movable,
         trajectories={name: track for name, track in tracks.items() if track.moves},
         is_dark=len(scene.emitters()) == 0,
-        diffuse=diffuse if _is_direct(integrator) and _fits(diffuse, responses) else None,
+        diffuse=diffuse if _follows_light(integrator) and _fits(diffuse, responses) else None,
         exact_because=because,
         camera=camera,
         integrator_plugin=plugin,
@@ -196,9 +196,10 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
     )
 
 
-def _is_direct(integrator: MitsubaObject) -> bool:
-    """True if light is followed from its sources to one surface."""
-    return integrator.class_name() in ("DirectIntegrator", "PathIntegrator") and path_depths(integrator)[0] == 2
+def _follows_light(integrator: MitsubaObject) -> bool:
+    """True if light is followed from its sources to surfaces."""
+    is_known = integrator.class_name() in ("DirectIntegrator", "PathIntegrator")
+    return is_known and path_depths(integrator)[0] not in (0, 1)
 
 
 def _fits(diffuse: DiffuseScene | None, responses: Mapping[str, Spectrum] | None) -> bool:
@@ -215,6 +216,7 @@ def _describe(
     """
     deformations: dict[str, Deformation] = {}
     all_diffuse = True
+    others: list[str] = []
     content: dict[str, Any] = {}
     groups: dict[str, list[str]] = {}
     paints: list[Paint] = []
@@ -248,6 +250,8 @@ def _describe(
         if is_diffuse(item) and (light is not None or radiance_of(item) is None):
             paints += [paint_of(item, part, picture) for part in parts]
             shining += [] if light is None else [light]
+        elif radiance_of(item) is None:
+            others += list(parts)
         else:
             all_diffuse = False
     try:
@@ -255,7 +259,7 @@ def _describe(
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
     has_map = any(light.type == "environment" for light in spec.lights)
-    diffuse = DiffuseScene(paints, direct_lights(spec.lights, shining)) if all_diffuse and not has_map else None
+    diffuse = DiffuseScene(paints, direct_lights(spec.lights, shining), others) if all_diffuse and not has_map else None
     return content, groups, diffuse, deformations
 
 

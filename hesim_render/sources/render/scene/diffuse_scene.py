@@ -1,11 +1,11 @@
-"""Scenes of diffuse surfaces under lights of closed form, as `transport.diffuse` renders them.
+"""Diffuse surfaces under lights of closed form, as `transport.diffuse` renders them.
 
 Those of this project's own objects are described by their file. Those of Mitsuba are read twice: the parsed scene says
 what its surfaces and lights are, and the loaded one has their spectra, pictures and places.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import pi
 from typing import Any
 
@@ -41,12 +41,14 @@ class DiffuseScene:
 
     Parameters
     ----------
-    paints : paint of all shapes that reflect light.
+    paints : paint of all shapes that reflect light diffusely.
     lights : all lights that are on; a sky comes last.
+    others : names of the shapes that reflect it in another way, none of which shines.
     """
 
     paints: list[Paint]
     lights: list[DirectLight]
+    others: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class ParsedPaint:
     name : id of the shape, empty if it has none.
     shines : True if the shape is a lamp as well.
     two_sided, scale : see `Paint`.
-    texture : ``even``, ``checks`` or ``picture``.
+    texture : ``even``, ``checks`` or ``picture``; ``other`` if the surface is not diffuse, or has no closed form.
     interpolation, repeats : of a picture.
     """
 
@@ -122,7 +124,13 @@ def _parsed_paint(nodes: Sequence[Any], node: Any) -> ParsedPaint | None:
     own: dict[str, Any] = {"name": node.props.id(), "shines": bool(lamps), "two_sided": False}
     if not bsdfs:
         return ParsedPaint(**own)  # what Mitsuba gives a shape without BSDF is diffuse
-    bsdf = bsdfs[0]
+    paint = _parsed_bsdf(nodes, bsdfs[0], own)
+    if paint is None and not lamps:
+        return ParsedPaint(node.props.id(), False, False, texture="other")
+    return paint
+
+
+def _parsed_bsdf(nodes: Sequence[Any], bsdf: Any, own: dict[str, Any]) -> ParsedPaint | None:
     if bsdf.props.plugin_name() == "twosided":
         inner = children_of(bsdf)
         if len(inner) != 1:
@@ -208,8 +216,11 @@ def _read(
     result = DiffuseScene([], [])
     for name, shape, paint in zip(names_of(shapes), shapes, parsed.paints, strict=True):
         picture = reader.picture(shape, paint)
-        if paint.texture == "picture" and picture is None:
-            return None
+        if paint.texture == "other" or (paint.texture == "picture" and picture is None):
+            if paint.shines:
+                return None
+            result.others.append(name)
+            continue
         colours = (constant(1.0),) if picture is not None else reader.colours(shape, paint)
         scale, repeats = paint.scale, picture is not None and paint.repeats
         result.paints.append(Paint(name, colours, scale, paint.two_sided, picture, repeats))

@@ -35,10 +35,12 @@ from hesim_render.core.device_types import (
 from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.diffuse_scene import DiffuseScene
 from hesim_render.sources.render.scene.pictures import TextureData
+from hesim_render.sources.render.transport.bounced import bounced_flux
 from hesim_render.sources.render.transport.light_sources import BallLamp, RectangleLamp, Sky, light_source
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.occluded_lamps import SLOTS, LampShadows
 from hesim_render.sources.render.transport.outlines import OccludedSky
+from hesim_render.sources.render.transport.paths import PathIntegrator
 from hesim_render.sources.render.transport.swept_boxes import Moment
 from hesim_render.sources.render.transport.texels import Texels
 from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product
@@ -61,8 +63,14 @@ class DiffuseIntegrator:
     responses : R per filter, in the order of the filter index; e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹.
     """
 
-    def __init__(self, scene: MovingScene, diffuse: DiffuseScene, responses: Mapping[str, Spectrum]) -> None:
-        self._scene = scene
+    def __init__(
+        self,
+        scene: MovingScene,
+        diffuse: DiffuseScene,
+        responses: Mapping[str, Spectrum],
+        paths: PathIntegrator | None = None,
+    ) -> None:
+        self._scene, self.paths = scene, paths
         #: Objects that compute e_k and draw a point, in the order of the scene's lights.
         self._lights = [light_source(scene.leaving, light) for light in diffuse.lights]
         irradiances = [light.level for light in diffuse.lights]
@@ -86,6 +94,9 @@ class DiffuseIntegrator:
             rows[paint.shape] = [numbers[0], numbers[-1], 1.0 + paint.two_sided, 0.0, *paint.scale, own, 0.0]
         for shape, number in lamp_of.items():
             rows.setdefault(shape, [0.0] * _ROW)[3] = number + 1.0
+        for shape in diffuse.others:
+            rows[shape] = [0.0] * (_ROW - 1) + [1.0]
+        self._has_others = bool(diffuse.others)
         self._has_checks = any(len(paint.colours) > 1 for paint in diffuse.paints)
         self._tables(rows, colours, irradiances, strengths, list(responses.values()))
         of_lights = irradiances, list(responses.values())
@@ -129,7 +140,7 @@ class DiffuseIntegrator:
         moment: Moment,
         filter_index: UInt32,
         shadows: UInt32 | None = None,
-    ) -> tuple[Float, Float, Float, Mask]:
+    ) -> tuple[Float, Float, Float, Float | None, Mask]:
         """Trace one ray per lane.
 
         Parameters
@@ -144,13 +155,18 @@ class DiffuseIntegrator:
         -------
         controlled, plain : Float, both estimates of the flux, e⁻/s; with `shadows`, the controlled one twice.
         unshadowed : Float, the flux if nothing hid any light, e⁻/s, but for `shadows` of a single shape, and for balls.
+        bounced : Float, the part of either estimate that paths find, e⁻/s; None if there are no paths.
         met : Bool, True where the path came through the box of a moving object.
         """
         mi, scene = self._scene.mi, self._scene
         if self._outlines is not None and self._outlines.groups:
             # outlines need these poses in all lanes, so surfaces and shadows may share them
             moment = scene.posed(moment, self._outlines.groups)
-        surface = scene.intersect(ray, moment, True, mi.Bool(True), mi.RayFlags.UV | mi.RayFlags.ShadingFrame)
+        flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
+        if self.paths is not None:
+            flags = mi.RayFlags.All if self._has_others else flags
+            ray.wavelengths = mi.UnpolarizedSpectrum(*self.paths.wavelengths.sample(filter_index, sampler.next_1d()))
+        surface = scene.intersect(ray, moment, True, mi.Bool(True), flags)
         si, met = surface.rest, surface.met
         hit = si.is_valid()
         which: UInt32 = dr.reinterpret_array(mi.UInt32, si.shape)
@@ -208,8 +224,17 @@ class DiffuseIntegrator:
                 # the housing of a lamp hides a part of it from everywhere
                 open_ = dr.select(blocked, 0.0, open_)
             unshadowed = dr.fma(scale, open_, unshadowed)
+        bounced = None
+        if self.paths is not None:
+            other = None
+            if self._has_others:
+                other = hit & (dr.gather(mi.Float, self._rows, 4 * first + _ROW - 1, hit) > 0)
+            of_paths = self.paths, sampler, surface, ray, moment, filter_index
+            bounced, near = bounced_flux(*of_paths, painted, other)
+            met |= near
+            controlled, plain, unshadowed = controlled + bounced, plain + bounced, unshadowed + bounced
         # known shadows are known in all windows, so there is no choice
-        return controlled, plain if shadows is None else controlled, unshadowed, met
+        return controlled, plain if shadows is None else controlled, unshadowed, bounced, met
 
     @property
     def moves_outlines(self) -> bool:

@@ -6,6 +6,7 @@ because it follows a path through one scene at one time. This one has two additi
 the images of lamps in flat mirrors (`LampImages`), and a uniform sky is not sampled (`spare_even_skies`).
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,24 @@ from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows, 
 _ROULETTE_MOST = 0.95
 #: Largest number of lights with separate boxes, which tell whether a ray may hit them; more lights share one box.
 _MOST_LAMPS = 8
+
+
+@dataclass(frozen=True)
+class Begun:
+    """First vertices of paths that begin with their second segment, per lane.
+
+    Parameters
+    ----------
+    vertex : Interaction3f, world space.
+    active : lanes that have one.
+    density : of the direction in which the path goes on. With a density of 0, what the second vertex emits is left out.
+    is_delta : True where this direction was the only one.
+    """
+
+    vertex: Interaction
+    active: Mask
+    density: Float
+    is_delta: Mask
 
 
 class PathIntegrator:
@@ -62,24 +81,29 @@ class PathIntegrator:
         self._images = LampImages.of(scene.mi, scene.static)
 
     @property
+    def bounces(self) -> bool:
+        """True if light may meet more than one surface."""
+        return self._max_depth > 2
+
+    @property
     def may_share(self) -> bool:
         """True if there are second vertices that neighbours may share; the chance of cones depends on the place."""
         return self._max_depth > 2 and not self._images
 
     def flux(
         self, sampler: MitsubaObject, ray: Ray, moment: Moment, filter_index: UInt32
-    ) -> tuple[Float, Float, Float, Mask]:
+    ) -> tuple[Float, Float, Float, None, Mask]:
         """Trace one ray per lane. Parameters and results as `DiffuseIntegrator.flux`, with one estimate in place of
-        two.
+        two, and no part apart.
         """
         ray.wavelengths = self.scene.mi.UnpolarizedSpectrum(*self.wavelengths.sample(filter_index, sampler.next_1d()))
         radiance, met = self.sample(sampler, ray, moment)
         # not dr.mean: it puts the number of lanes into the kernel, so that each new number would compile again
         flux = dr.sum(radiance) / len(radiance) * self.wavelengths.total(filter_index)
-        return flux, flux, flux, met
+        return flux, flux, flux, None, met
 
     def sample(
-        self, sampler: MitsubaObject, ray: Ray, moment: Moment, begun: tuple[Interaction, Mask] | None = None
+        self, sampler: MitsubaObject, ray: Ray, moment: Moment, begun: Begun | None = None
     ) -> tuple[Bands, Mask]:
         """Trace one path per lane.
 
@@ -88,8 +112,7 @@ class PathIntegrator:
         sampler : `next_vertex`, see `CounterSampler`.
         ray : Ray3f with wavelengths, world space.
         moment : time of each ray.
-        begun : first vertex of paths whose second segment is `ray`, and the lanes that have one; light that the second
-            vertex itself emits is then left out. None for paths from the camera.
+        begun : first vertices of paths whose second segment is `ray`; None for paths from the camera.
 
         Returns
         -------
@@ -104,9 +127,8 @@ class PathIntegrator:
         before_pdf, before_delta = mi.Float(1.0), mi.Bool(True)
         ray, active = mi.Ray3f(ray), mi.Bool(True)
         if begun is not None:
-            # with a density of 0, sampling of lamps has the whole weight of what the next vertex emits
-            before, active = mi.Interaction3f(begun[0]), mi.Bool(begun[1])
-            before_pdf, before_delta = mi.Float(0.0), mi.Bool(False)
+            before, active = mi.Interaction3f(begun.vertex), mi.Bool(begun.active)
+            before_pdf, before_delta = mi.Float(begun.density), mi.Bool(begun.is_delta)
         most, roulette_depth = (dr.opaque(mi.UInt32, depth) for depth in (self._max_depth, self._roulette_depth))
 
         def step(*state: Any) -> LoopState:
@@ -151,7 +173,8 @@ class PathIntegrator:
         active &= most > depth + 1
         state = sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active, left
         if self._max_depth == 2:
-            end = step(*state)  # a single step needs no loop, which costs time
+            # a single step needs no loop, which costs time
+            end = step(*state) if begun is None else state
         else:
             end = dr.while_loop(state, lambda *values: values[-2], step, label="paths")
         _, depth, met, throughput, radiance, _, *before, ray, _, left = end
@@ -196,6 +219,7 @@ class PathIntegrator:
         goes_on: Mask,
         may_follow: Mask,
         numbers: tuple[Point2, Float, Point2],
+        asks: Mask | bool = True,
     ) -> tuple[Bands, MitsubaObject, Bands, Mask]:
         """Light of one lamp that a vertex reflects, and the direction in which the path goes on.
 
@@ -205,6 +229,7 @@ class PathIntegrator:
         goes_on : lanes with a vertex.
         may_follow : lanes with two segments or more to go.
         numbers : random numbers `place`, `lobe` and `light`, see `CounterSampler.next_vertex`.
+        asks : lanes in which a lamp is sampled; False for none, which takes no time.
 
         Returns
         -------
@@ -214,10 +239,25 @@ class PathIntegrator:
         """
         mi, scene, si = self.scene.mi, self.scene, surface.rest
         context, bsdf = mi.BSDFContext(), si.bsdf()
-        place, lobe, light = numbers
+        place, choice, light = numbers
+        lobe = choice
+
+        cones = None
+        if self._images:
+            # a path to the image of a lamp needs two more segments
+            is_diffuse = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & may_follow
+            upwards = dr.mulsign(mi.Vector3f(surface.shading_normal), mi.Frame3f.cos_theta(si.wi))
+            cones = self._images.seen_from(surface.world.p, upwards, is_diffuse)
+            # where no cone is chosen, rescale the random number for the surface's own sampling
+            lobe = dr.maximum(choice - cones.chance, 0.0) / (1 - cones.chance)
+        if asks is False:
+            chosen, weight = bsdf.sample(context, si, lobe, place, goes_on)
+            if cones is not None:
+                weight = _redirected(bsdf, context, surface, cones, choice, place, chosen, weight)
+            return mi.Spectrum(0.0), chosen, si.to_world_mueller(weight, -chosen.wo, si.wi), mi.Bool(False)
 
         # sample a light from this vertex
-        asks = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        asks = goes_on & asks & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         seen, weight = scene.static.sample_emitter_direction(surface.world, light, False, asks)
         asks &= seen.pdf != 0
         shadow = scene.leaving.to(surface.world, seen.p)
@@ -230,16 +270,8 @@ class PathIntegrator:
         clear = asks & ~blocked
 
         towards = surface.to_local(seen.d)
-        choice = lobe
-        if self._images:
-            # a path to the image of a lamp needs two more segments
-            is_diffuse = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & may_follow
-            upwards = dr.mulsign(mi.Vector3f(surface.shading_normal), mi.Frame3f.cos_theta(si.wi))
-            cones = self._images.seen_from(surface.world.p, upwards, is_diffuse)
-            # where no cone is chosen, rescale the random number for the surface's own sampling
-            lobe = dr.maximum(choice - cones.chance, 0.0) / (1 - cones.chance)
         value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(context, si, towards, lobe, place, goes_on)
-        if self._images:
+        if cones is not None:
             pdf = dr.fma(1 - cones.chance, pdf, cones.density(seen.d))
             chosen_weight = _redirected(bsdf, context, surface, cones, choice, place, chosen, chosen_weight)
         value = si.to_world_mueller(value, -towards, si.wi)

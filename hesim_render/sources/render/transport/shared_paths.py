@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from hesim_render.core.backend import jit
 from hesim_render.core.device import dr
 from hesim_render.core.device_types import Bands, Float, Interaction, LoopState, Mask, MitsubaObject, Ray, UInt32
-from hesim_render.sources.render.transport.paths import PathIntegrator
+from hesim_render.sources.render.transport.paths import Begun, PathIntegrator
 from hesim_render.sources.render.transport.swept_boxes import Moment
 
 #: A density of directions is that of a diffuse surface if it differs by less than this, 1/sr.
@@ -123,7 +123,7 @@ class SharedPaths:
         dr.eval(direct, weight, begin, upwards, shares, following, arrives, is_shared, place, back, met)
         dr.eval(sampler.state, sampler.dimension)
         # what each second vertex sends back
-        sent, near = paths.sample(sampler, following, moment, (begin, arrives))
+        sent, near = paths.sample(sampler, following, moment, Begun(begin, arrives, mi.Float(0.0), mi.Bool(False)))
         sent = dr.select(arrives, sent, 0.0)
         met |= near
         dr.eval(sent, met)
