@@ -1,18 +1,24 @@
 """Scenes of which some light has a closed form and some is found by paths: what decides their rays."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+from unittest import mock
+
 import numpy as np
 import pytest
-from rendering import D65_1000_LUX, make_scene, mono, pair_tracer
+from rendering import D65_1000_LUX, make_scene, mono, pair_tracer, traced
 
 import hesim_render as hr
 from hesim_render.core.rng import Stream
+from hesim_render.sources.render.change_driven import adaptive
+from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.allocation import allocate, gain_of
 from hesim_render.sources.render.change_driven.bends import straightened
 from hesim_render.sources.render.change_driven.differences import Differences
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.neighbours import Lattice, Sites
 from hesim_render.sources.render.change_driven.pilot import Pilot
-from hesim_render.sources.render.change_driven.plan import Plan
+from hesim_render.sources.render.change_driven.plan import Plan, plan
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.scene import surfaces
@@ -86,6 +92,8 @@ def test_a_pilot_knows_the_scatter_of_what_paths_find(depth):
     rest = seen.bounced_scatter[~on_ball]
     assert (np.median(rest) == 0.0) == (depth == 2)
     assert np.median(rest) < 0.1 * np.median(seen.plain_scatter[~on_ball])
+    # nothing is known of what hides light from it
+    np.testing.assert_allclose(seen.unshadowed[on_ball], seen.plain[on_ball], rtol=1e-5)
     # it is never mild
     np.testing.assert_array_equal(mild.bounced_scatter, seen.bounced_scatter)
     assert np.all(mild.plain_scatter <= seen.plain_scatter * 1.0001)
@@ -121,6 +129,27 @@ def test_a_ball_of_plastic_does_not_make_a_scene_dear(monkeypatch):
         assert pixel.size > 200 and np.sqrt(np.mean(off**2)) < 0.5
 
 
+def test_what_passes_before_a_lamp_of_glossy_things_comes_near():
+    """A speck between a point light and a floor of plastic: shadow rays alone come through its box."""
+    floor = {"name": "floor", "shape": "rectangle", "size_m": [3, 3, 0], "material": {"type": "plastic"}}
+    speck = {"name": "speck", "shape": "sphere", "size_m": [0.012] * 3, "position_m": [0.25, 0, 0.5]}
+    beside = {"name": "beside", "shape": "rectangle", "size_m": [0.1, 0.1, 0], "position_m": [2, 2, 0]}
+    scene = make_scene(
+        objects=[floor, {**speck, "reflectance": 0.3}, {**beside, "reflectance": 0.3}], max_depth=2,
+        light={"type": "point", "position_m": [0.5, 0, 1], "illuminant": "D65", "illuminance_lux": 500,
+               "plane_point_m": [0, 0, 0], "plane_normal": [0, 0, 1]},
+        camera={"origin_m": [0, 0, 1.5], "target_m": [0, 0, 0], "horizontal_fov_deg": 12},
+        motion=[{"object": "speck", "keyframes": [{"t_us": 0}, {"t_us": 50_000, "translation_m": [0, 0.01, 0]}]}],
+    )  # fmt: skip
+    tracer = pair_tracer(scene, mono(48, 36))
+    assert tracer.has_bounced
+    met = traced(tracer, 8, 0.0, 100.0).met.reshape(36, 48)
+    row, col = np.nonzero(met)
+    # around the middle of the picture lies its shadow, of the size of the speck twice
+    assert 0.002 < met.mean() < 0.3 and abs(row.mean() - 17.5) < 6 and abs(col.mean() - 23.5) < 6
+    assert met[16:20, 22:26].all()
+
+
 def test_only_pixels_that_paths_decide_are_looked_at_for_bends():
     class Tracer:
         def pilot(self, pixel, *_, **__):
@@ -138,3 +167,56 @@ def test_only_pixels_that_paths_decide_are_looked_at_for_bends():
             straightened(Tracer(), np.arange(20, 24, dtype=np.uint32), windows, what, TUNING, among)
     assert looked == [[20, 21, 22, 23], [21, 23]]
     assert straightened(Tracer(), np.arange(4, dtype=np.uint32), windows, what, TUNING, np.array([], int)) is what
+
+
+def test_a_plan_says_which_of_its_pairs_follow_the_law_of_paths():
+    """Paths find much in the first pixel in the first window, and in the last one in the third."""
+    scatter, flux = np.full((3, 7), 0.9, np.float32), np.full((3, 7), 1.5, np.float32)
+    bounced = np.zeros((3, 7), np.float32)
+    bounced[0, 0] = bounced[2, 6] = 0.9
+    sites, gain = Sites.around(np.arange(7, dtype=np.uint32), Lattice.whole(1, 7)), Gain(*TUNING.diffuse_gain)
+
+    def planned(**others):
+        pilot = Pilot(flux, flux, scatter, scatter, flux, **others)
+        return plan(pilot, sites, lambda seen: 0.03 + 0 * seen, 0.5, gain, TUNING, is_knot=True)
+
+    what = planned(bounced_scatter=bounced)
+    assert what.bounces.astype(int).tolist() == [[1, 1, 0, 0, 0, 0, 0], [0] * 7, [0, 0, 0, 0, 0, 1, 1]]
+    assert what.first().bounces.astype(int).tolist() == [[1, 1, 0, 0, 0, 0, 0]]
+    assert planned().bounces is None and planned().first().bounces is None
+
+
+def test_lines_follow_the_law_of_their_pair():
+    shape, given = (4, 3), []
+    window, pixel = np.indices(shape)
+    todo, bounces = (window + 2 * pixel) % 3 == 1, (window + pixel) % 2 == 0
+    what = SimpleNamespace(rays=np.full(shape, 512), controlled=todo, wanted=1.5 + pixel, floor=0 * pixel, shadows=None)
+    own = SimpleNamespace(
+        tracer=SimpleNamespace(rays=SimpleNamespace(is_box=True)), gain=Gain(*TUNING.diffuse_gain), tuning=TUNING
+    )
+    with mock.patch.object(adaptive, "about_edges", lambda *some, **_: given.append(some[6])):
+        for what.bounces in (bounces, None):
+            AdaptiveRenderer.rays_of(own, None, what, todo, None)
+    np.testing.assert_allclose(given[0].factor, np.where(bounces[todo], 0.46, 0.68))
+    np.testing.assert_allclose(given[0].power, np.where(bounces[todo], 0.56, 0.7))
+    assert given[1] is own.gain
+
+
+@pytest.mark.parametrize("of_changes", [False, True])
+def test_references_follow_the_law_of_paths_where_these_decide(of_changes):
+    """By the law of closed forms everywhere, and by that of paths: more rays."""
+    pixel, ends, rays = np.arange(0, 40 * 30, 29, dtype=np.uint32), np.array([400.0, 1400.0]), []
+    for part in (1e9, 0.0):
+        source = ChangeDrivenFlux(turning(4), mono(40, 30), 0.5, seed=2)
+        source._renderer.tuning = replace(source._renderer.tuning, bounced_part=part)
+        before = source.rays_traced
+        if of_changes:
+            end = np.repeat(ends[:, None], pixel.size, axis=1)
+            planned = source._references._planned(source._index[pixel], end - 100, end, 0, 0.1)
+            # most of the sky is open, and lets the closed form scatter less
+            assert set(np.unique(planned[2])) == {0.0, 1.0} and planned[2].mean() > 0.5
+            rays.append(int((planned[0] * planned[1]).sum()))
+        else:
+            source.reference_flux(pixel, np.full(pixel.size, 300.0), np.full(pixel.size, 400.0), 0.1, True)
+            rays.append(source.rays_traced - before)
+    assert rays[1] > (1.0 if of_changes else 1.1) * rays[0]

@@ -302,12 +302,14 @@ def test_what_else_has_no_closed_form_is_seen_by_paths_beside_it(tmp_path, old, 
     assert tracer.has_bounced and not tracer.is_diffuse
 
 
-#: Things that are not diffuse: of smooth plastic, mirrored, of glass, and with holes.
+#: Things that are not diffuse: glossy with bumps, a mirror that shows the lamp, and with holes.
 OTHERS = """
   <shape type="sphere" id="gloss"><point name="center" x="0.12" y="-0.12" z="0.1"/><float name="radius" value="0.07"/>
-    <bsdf type="roughplastic"><float name="alpha" value="0.3"/></bsdf></shape>
+    <bsdf type="bumpmap"><texture type="bitmap" name="bumps"><string name="filename" value="grey.png"/></texture>
+    <float name="scale" value="0.3"/><bsdf type="roughplastic"><float name="alpha" value="0.3"/></bsdf></bsdf></shape>
   <shape type="rectangle" id="mirror"><transform name="to_world">
-    <scale x="0.11" y="0.14"/><rotate y="1" angle="35"/><translate x="-0.28" y="-0.16" z="0.02"/></transform>
+    <scale x="0.09" y="0.11"/><rotate y="1" angle="20.9"/><rotate x="1" angle="-14"/>
+    <translate x="-0.28" y="-0.16" z="0.02"/></transform>
     <bsdf type="twosided"><bsdf type="conductor"/></bsdf></shape>
   <shape type="rectangle" id="veil"><transform name="to_world">
     <scale x="0.12" y="0.06"/><translate x="0.1" y="0.28" z="0.09"/></transform>

@@ -229,7 +229,7 @@ class PathIntegrator:
         goes_on : lanes with a vertex.
         may_follow : lanes with two segments or more to go.
         numbers : random numbers `place`, `lobe` and `light`, see `CounterSampler.next_vertex`.
-        asks : lanes in which a lamp is sampled; False for none, which takes no time.
+        asks : lanes in which a lamp is sampled; False for none, where all surfaces are diffuse.
 
         Returns
         -------
@@ -239,21 +239,10 @@ class PathIntegrator:
         """
         mi, scene, si = self.scene.mi, self.scene, surface.rest
         context, bsdf = mi.BSDFContext(), si.bsdf()
-        place, choice, light = numbers
-        lobe = choice
-
-        cones = None
-        if self._images:
-            # a path to the image of a lamp needs two more segments
-            is_diffuse = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & may_follow
-            upwards = dr.mulsign(mi.Vector3f(surface.shading_normal), mi.Frame3f.cos_theta(si.wi))
-            cones = self._images.seen_from(surface.world.p, upwards, is_diffuse)
-            # where no cone is chosen, rescale the random number for the surface's own sampling
-            lobe = dr.maximum(choice - cones.chance, 0.0) / (1 - cones.chance)
+        place, lobe, light = numbers
         if asks is False:
+            # where all surfaces are diffuse, there are no mirrors, and no images of lamps in them
             chosen, weight = bsdf.sample(context, si, lobe, place, goes_on)
-            if cones is not None:
-                weight = _redirected(bsdf, context, surface, cones, choice, place, chosen, weight)
             return mi.Spectrum(0.0), chosen, si.to_world_mueller(weight, -chosen.wo, si.wi), mi.Bool(False)
 
         # sample a light from this vertex
@@ -270,8 +259,16 @@ class PathIntegrator:
         clear = asks & ~blocked
 
         towards = surface.to_local(seen.d)
+        choice = lobe
+        if self._images:
+            # a path to the image of a lamp needs two more segments
+            is_diffuse = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & may_follow
+            upwards = dr.mulsign(mi.Vector3f(surface.shading_normal), mi.Frame3f.cos_theta(si.wi))
+            cones = self._images.seen_from(surface.world.p, upwards, is_diffuse)
+            # where no cone is chosen, rescale the random number for the surface's own sampling
+            lobe = dr.maximum(choice - cones.chance, 0.0) / (1 - cones.chance)
         value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(context, si, towards, lobe, place, goes_on)
-        if cones is not None:
+        if self._images:
             pdf = dr.fma(1 - cones.chance, pdf, cones.density(seen.d))
             chosen_weight = _redirected(bsdf, context, surface, cones, choice, place, chosen, chosen_weight)
         value = si.to_world_mueller(value, -towards, si.wi)
