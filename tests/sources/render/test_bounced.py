@@ -150,6 +150,27 @@ def test_what_passes_before_a_lamp_of_glossy_things_comes_near():
     assert met[16:20, 22:26].all()
 
 
+@pytest.mark.parametrize("depth", [2, 3])
+def test_a_lamp_in_a_mirror_is_as_bright_as_by_paths_alone(monkeypatch, depth):
+    mirror = {"name": "mirror", "shape": "rectangle", "size_m": [0.1, 0.3, 0], "material": {"type": "conductor"}}
+    card = {"name": "card", "shape": "rectangle", "size_m": [1, 1, 0], "position_m": [0, 0, -0.1], "reflectance": 0.4}
+    lamp = {
+        "type": "area",
+        "illuminant": "D65",
+        "illuminance_lux": 700,
+        "position_m": [0.1, 0, 2.2],
+        "size_m": [1.3, 1],
+    }
+    camera = {"origin_m": [0, 0, 1.5], "target_m": [0, 0, 0], "horizontal_fov_deg": 12}
+    scene = make_scene(objects=[mirror, card], light=lamp, camera=camera, max_depth=depth)
+    both = traced(pair_tracer(scene, mono(48, 36)), 256).mean
+    monkeypatch.setattr(surfaces, "_MOST_ENTRIES", -1)
+    alone = traced(pair_tracer(scene, mono(48, 36)), 256).mean
+    assert alone.max() > 5 * np.median(alone), "the mirror does not show the lamp"
+    # but in the shadow of the mirror, of which either has few rays
+    assert np.isclose(both, alone, rtol=0.02).mean() > 0.97
+
+
 def test_only_pixels_that_paths_decide_are_looked_at_for_bends():
     class Tracer:
         def pilot(self, pixel, *_, **__):

@@ -308,7 +308,7 @@ OTHERS = """
     <bsdf type="bumpmap"><texture type="bitmap" name="bumps"><string name="filename" value="grey.png"/></texture>
     <float name="scale" value="0.3"/><bsdf type="roughplastic"><float name="alpha" value="0.3"/></bsdf></bsdf></shape>
   <shape type="rectangle" id="mirror"><transform name="to_world">
-    <scale x="0.09" y="0.11"/><rotate y="1" angle="20.9"/><rotate x="1" angle="-14"/>
+    <scale x="0.09" y="0.11"/><rotate y="1" angle="25.1"/><rotate x="1" angle="-17.1"/>
     <translate x="-0.28" y="-0.16" z="0.02"/></transform>
     <bsdf type="twosided"><bsdf type="conductor"/></bsdf></shape>
   <shape type="rectangle" id="veil"><transform name="to_world">

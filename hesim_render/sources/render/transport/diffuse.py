@@ -164,7 +164,7 @@ class DiffuseIntegrator:
             moment = scene.posed(moment, self._outlines.groups)
         flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
         if self.paths is not None:
-            flags = mi.RayFlags.All if self._has_others else flags
+            flags = mi.RayFlags.All
             ray.wavelengths = mi.UnpolarizedSpectrum(*self.paths.wavelengths.sample(filter_index, sampler.next_1d()))
         surface = scene.intersect(ray, moment, True, mi.Bool(True), flags)
         si, met = surface.rest, surface.met
