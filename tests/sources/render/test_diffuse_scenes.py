@@ -245,6 +245,7 @@ def test_light_of_a_ball_that_its_housing_hides_does_not_count():
 
 RED = '<rgb name="reflectance" value="0.61, 0.33, 0.2"/>'
 BITMAP = '<texture type="bitmap" name="{}"><string name="filename" value="colour.png"/>{}</texture>'
+RAW = BITMAP.format("reflectance", '<boolean name="raw" value="true"/>')
 
 
 def changed(text, old, new):
@@ -267,6 +268,7 @@ def changed(text, old, new):
         ('<emitter type="point"><point name="position" x="-0.4" y="0.3" z="0.7"/>', '<emitter type="spot">'),
         ('name="max_depth" value="2"', 'name="max_depth" value="1"'),
         # surfaces of lamps
+        ('<ref id="clay"/></bsdf>', f'<bsdf type="diffuse">{RAW}</bsdf></bsdf>'),
         (f'<bsdf type="diffuse" id="clay">{RED}</bsdf>', '<bsdf type="plastic" id="clay"/>'),
         ('<ref id="clay"/></bsdf>', '<ref id="clay"/><ref id="spare"/></bsdf>'),
         (RED, BITMAP.format("reflectance", '<transform name="to_uv"><scale x="0"/></transform>')),
