@@ -583,11 +583,11 @@ def test_what_a_linked_pair_becomes():
 
 @pytest.mark.slow
 def test_linked_pairs_have_no_bias_and_the_noise_of_their_differences(scene_of):
-    """A whole run with few rays of pairs by themselves, for twelve seeds, against paths that share nothing."""
+    """A whole run with few rays of pairs by themselves, for thirty seeds, against paths that share nothing."""
     few = replace(TUNING, most_rays=512, least_shared_rays=32, least_sharing_gain=0.1, difference_gain=1e9)
     scene = scene_of(WALLS + THINGS.split('<shape type="sphere" id="shiny">')[0], motion=MOTION)
     runs, linked = [], []
-    for seed in range(12):
+    for seed in range(30):
         source = source_of(scene, crop=(9, 7, 166, 121), seed=seed, tuning=few)
         given = Anchor.link
 
@@ -600,16 +600,16 @@ def test_linked_pairs_have_no_bias_and_the_noise_of_their_differences(scene_of):
             blocks = list(source.sample_blocks(1, 0, 5000))
             flux = source.flux_of_blocks(source.sensor.layout.evs_pixel.ravel(), blocks)
             runs.append([(np.array(one.half_a), np.array(one.half_b)) for one in flux])
-    assert sum(linked) > 12 * 20
+    assert sum(linked) > 30 * 20
     ends_us = np.concatenate([block.end_us[block.wanted] for block in blocks])
     halves = np.array(runs, np.float64)  # [seed, window, half, pixel]
     tracer, pixel, _ = parts_of(source)
     windows, every = Windows(ends_us - 1, ends_us), np.arange(ends_us.size)
     index, window = np.tile(pixel, ends_us.size), np.repeat(every, pixel.size)
     given = index, window, windows, np.full(index.size, 4096), np.zeros(index.size, np.bool_)
-    truth = np.mean([tracer.trace(*given, stream=Stream.AUDIT, repeat=k).mean for k in range(2)], axis=0)
+    truth = np.mean([tracer.trace(*given, stream=Stream.AUDIT, repeat=k).mean for k in range(8)], axis=0)
     values, truth = halves.mean(axis=2), truth.reshape(ends_us.size, -1)
     total = (values / truth).mean(axis=(1, 2)) - 1
-    assert abs(total.mean()) < 4 * total.std(ddof=1) / 12**0.5
+    assert abs(total.mean()) < 4 * total.std(ddof=1) / 30**0.5
     stated = 0.5 * (halves[:, :, 0] - halves[:, :, 1]) / truth
     assert np.sqrt(np.mean((values / truth - 1) ** 2)) == pytest.approx(np.sqrt(np.mean(stated**2)), rel=0.15)
