@@ -184,14 +184,18 @@ def test_the_skirts_of_a_measured_psf_change_with_what_moves_far_away():
         motion=[{"object": "spark", "keyframes": ends}], camera={"origin_m": [0, 0, 1], "horizontal_fov_deg": 6},
     )  # fmt: skip
     sensor, pixels = rendering.mono(64, 48, lens__psf=told), np.arange(64 * 48, dtype=np.uint32)
-    flux = ChangeDrivenFlux(scene, sensor, 0.5, seed=1)
-    assert not flux.still_pixels(pixels).any()
-    change, wanted = [], []
+    wanted, shares = [], []
     for t_us in (1_000.0, 9_000.0):
-        change.append(sum(np.array(half) for half in flux.mean_flux(pixels, t_us, t_us + 10)) / 2)
         a, b, _ = rendering.flux_image(scene, sensor, 1024, 9, t_us, t_us + 10)
         wanted.append(((a + b) / 2).ravel())
-    found, expected = change[1] - change[0], wanted[1] - wanted[0]
+    expected = wanted[1] - wanted[0]
     skirt = np.abs(expected) < 0.02 * np.abs(expected).max()
-    share = np.sum((found * np.sign(expected))[skirt]) / np.sum(np.abs(expected)[skirt])
-    assert skirt.sum() > 1000 and 0.7 < share < 1.1  # noise of the expected values makes their sum a little larger
+    # one ray in thousands meets the lamp, so that a single seed is off by a quarter
+    for seed in range(1, 9):
+        flux = ChangeDrivenFlux(scene, sensor, 0.5, seed=seed)
+        assert not flux.still_pixels(pixels).any()
+        means = [sum(np.array(half) for half in flux.mean_flux(pixels, t, t + 10)) / 2 for t in (1_000.0, 9_000.0)]
+        found = means[1] - means[0]
+        shares.append(np.sum((found * np.sign(expected))[skirt]) / np.sum(np.abs(expected)[skirt]))
+    # noise of the expected values makes their sum a little larger
+    assert skirt.sum() > 1000 and 0.7 < np.mean(shares) < 1.1

@@ -171,6 +171,26 @@ def test_a_lamp_in_a_mirror_is_as_bright_as_by_paths_alone(monkeypatch, depth):
     assert np.isclose(both, alone, rtol=0.02).mean() > 0.97
 
 
+def test_aimed_rays_bring_by_paths_what_they_bring_where_nothing_else_is_seen():
+    """A speck of plastic before a wall of plastic; rays aimed at it have weights."""
+    plastic = {"type": "roughplastic", "alpha": 0.3}
+    wall = {"name": "wall", "shape": "rectangle", "size_m": [3, 3, 0], "material": plastic}
+    speck = {"name": "speck", "shape": "sphere", "size_m": [0.0011] * 3, "position_m": [0.002, 0.001, 0.2]}
+    card = {"name": "card", "shape": "rectangle", "size_m": [0.1, 0.1, 0], "position_m": [2, 2, 0], "reflectance": 0.3}
+    ends = [{"t_us": 0}, {"t_us": 50_000, "translation_m": [0.01, 0.003, 0]}]
+    scene = make_scene(
+        objects=[wall, {**speck, "material": plastic}, card], light=D65_1000_LUX, max_depth=2,
+        camera={"origin_m": [0.01, 0.02, 1.5], "target_m": [0, 0.01, 0], "horizontal_fov_deg": 5},
+        motion=[{"object": "speck", "keyframes": ends}],
+    )  # fmt: skip
+    renderer = ChangeDrivenFlux(scene, mono(24, 18), 0.5, seed=4)._renderer
+    band = next(renderer.bands(np.arange(24 * 18, dtype=np.uint32), "any"))
+    windows, first = Windows(np.array([100.0]), np.array([700.0])), np.zeros((1, band.sites.size), np.int64)
+    pilot, _ = renderer.pilot(band, windows, first, None)
+    assert pilot.aims is not None and renderer.tracer.has_bounced
+    np.testing.assert_allclose(pilot.bounced_scatter, pilot.plain_scatter, rtol=1e-4)
+
+
 def test_only_pixels_that_paths_decide_are_looked_at_for_bends():
     class Tracer:
         def pilot(self, pixel, *_, **__):

@@ -200,4 +200,4 @@ def test_image_of_a_plastic_ball():
 
 @pytest.mark.slow
 def test_image_of_a_rough_ball_with_interreflection():
-    assert_right_mean(glossy_ball("roughplastic", 4), range(64))
+    assert_right_mean(glossy_ball("roughplastic", 4), range(88))

@@ -13,6 +13,7 @@ from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.references import References
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
+from hesim_render.sources.render.scene import surfaces
 
 BALL = Path(__file__).parents[3] / "benchmarks/scenes/floor-ball.yaml"
 #: Ends of four windows, the third of which changes are counted from.
@@ -40,7 +41,7 @@ def ball():
     return source, changes, source.rays_traced - done
 
 
-def test_changes_are_as_good_as_those_of_levels_from_a_part_of_the_rays(ball):
+def test_changes_are_as_good_as_those_of_levels_from_a_part_of_the_rays(ball, monkeypatch):
     """Against 6 × 4096 rays of the run's own stream. Asked for is a quarter of a noise unit."""
     source, changes, rays = ball
     pixel, begin, end = asked(90)
@@ -76,6 +77,13 @@ def test_changes_are_as_good_as_those_of_levels_from_a_part_of_the_rays(ball):
     source.reference_flux(*every, 0.25, True)
     # closed forms make levels cheap as well
     assert rays < 0.9 * (source.rays_traced - before)
+    monkeypatch.setattr(surfaces, "_MOST_ENTRIES", -1)
+    alone = source_of()
+    assert not alone._tracer.has_bounced
+    alone.reference_changes(pixel, begin, end, np.ones(end.shape, np.bool_), BASE, 0.25)
+    before = alone.rays_traced
+    alone.reference_flux(*every, 0.25, True)
+    assert before < 0.6 * (alone.rays_traced - before)
 
 
 def test_all_windows_of_a_unit_have_one_number_of_rays(monkeypatch):

@@ -63,8 +63,9 @@ def allocate(
 
     Returns
     -------
-    rays, controlled, error, floor : [n] each: number of rays, choice of the estimator with a control variate, expected
-        error, and number of rays that knowledge of an edge does not lower; see `Plan`.
+    rays, controlled, error, floor, bounces : [n] each: number of rays, choice of the estimator with a control variate,
+        expected error, number of rays that knowledge of an edge does not lower, and pairs with the law of paths; see
+        `Plan`.
     """
     low, high = (window, window + 1) if is_knot else (max(0, window - 1), window + 2)
     flux, here = pilot.flux_in(window), sites.listed
@@ -72,21 +73,23 @@ def allocate(
     own, value = units[window][here], flux[here]
     # variance of a single ray by either estimator, [n]: half from the pixel itself, half from those around it, as the
     # few rays of one pilot miss what covers a small part of the pixel
-    squares = []
-    for table in (pilot.controlled_scatter, pilot.plain_scatter):
+    tables, squares = [pilot.controlled_scatter, pilot.plain_scatter], []
+    if pilot.bounced_scatter is not None:
+        tables.append(pilot.bounced_scatter)
+    for table in tables:
         square = (table[window] * _SMALLER) ** 2
         squares.append(np.float32(0.5) * (square[here] + sites.mean(square)))
     if pilot.refined:
         # where the pilot looked again with many rays, their scatter counts if it is the larger one
         refined = pilot.refined[window]
-        for square, scatter_there in zip(squares, (refined.controlled_scatter, refined.plain_scatter), strict=True):
+        for square, scatter_there in zip(squares, (refined.controlled_scatter, refined.plain_scatter), strict=False):
             seen = np.zeros(sites.size, np.float32)
             seen[refined.place] = (scatter_there * _SMALLER) ** 2
             np.maximum(square, seen[here], out=square)
     open_flux = pilot.unshadowed[window]
     # the control variate pays where most of the unshadowed light arrives; deep in shadow it would add its own noise
     controlled = (squares[0] <= squares[1]) & (2 * value >= open_flux[here])
-    scatter = np.sqrt(np.where(controlled, *squares)) / _SMALLER
+    scatter = np.sqrt(np.where(controlled, *squares[:2])) / _SMALLER
     # an edge in a neighbour may reach into this pixel between the pilot rays
     around = pilot.flux_in(slice(low, high))
     highest, lowest = around.max(axis=0), around.min(axis=0)
@@ -95,15 +98,13 @@ def allocate(
     # if a neighbour sees light that is occluded here, part of it may be visible here too
     is_light_near = sites.most(flux > np.float32(1e-6) * open_flux, REACH)
     brighter = np.maximum(sites.most(highest, 2) - value, np.where(is_light_near, open_flux[here] - value, 0))
+    wanted_error = np.float32(quality) * own
     # where paths find much beside closed forms, the law is that of paths
     bounces = np.zeros(value.shape, np.bool_)
     if pilot.bounced_scatter is not None:
-        square = (pilot.bounced_scatter[window] * _SMALLER) ** 2
-        bounced = np.sqrt(np.float32(0.5) * (square[here] + sites.mean(square))) / _SMALLER
-        needed = scatter / (np.float32(quality) * own)
-        gain, bounces = gain_of(bounced, needed, np.float32(quality) * own, gain, tuning)
+        bounced = np.sqrt(squares[2]) / _SMALLER
+        gain, bounces = gain_of(bounced, scatter / wanted_error, wanted_error, gain, tuning)
     # rays for what the pilot may have missed: an edge that covers `unseen_area` of the pixel, or light beside it
-    wanted_error = np.float32(quality) * own
     for_unseen = np.maximum(gain.rays(unseen / wanted_error), np.float32(tuning.bright_rays) * brighter / own)
     # rays for what it has seen; interpolated windows lean on the ends of a block, so these get more
     wanted = gain.rays(scatter / wanted_error) * np.float32(tuning.knot_factor if is_knot else 1.0)

@@ -184,12 +184,10 @@ def plan(
     # rays, estimator and expected error of every pair; many windows are interpolated from the ends of a block
     for window, some in enumerate(map(np.flatnonzero, out.rendered)):
         at_end = is_knot and window in (0, last)
-        part = allocate(pilot, window, sites.only(some), units, quality, gain, tuning, at_end)
-        out.rays[window, some], out.controlled[window, some], out.error[window, some], out.floor[window, some] = part[
-            :4
-        ]
+        *part, bounces = allocate(pilot, window, sites.only(some), units, quality, gain, tuning, at_end)
+        out.rays[window, some], out.controlled[window, some], out.error[window, some], out.floor[window, some] = part
         if out.bounces is not None:
-            out.bounces[window, some] = part[4]
+            out.bounces[window, some] = bounces
     # where little changes, few rays of a difference do what many rays of the pair alone would
     chosen = differences(pilot, sites, units, quality, out.rendered, out.rays, tuning, out.error, shares)
     if follows and last > 1:

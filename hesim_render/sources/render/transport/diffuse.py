@@ -47,20 +47,23 @@ from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product
 from hesim_render.targets.piece import Picture
 
 #: Columns of a shape's row in the table of paints: number of its one or two colours, how many of its sides are painted,
-#: number of its lamp from 1, the scale of its checks or picture, and the number of its picture from 1.
+#: number of its lamp from 1, the scale of its checks or picture, the number of its picture from 1, and 1 for a shape
+#: that is not diffuse.
 _ROW = 8
 #: Row of a shape without paint: its front is black.
 _BLACK = (0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0)
 
 
 class DiffuseIntegrator:
-    """Flux of direct light through a `MovingScene` of diffuse shapes; the module docstring has the method.
+    """Flux of direct light on the diffuse shapes of a `MovingScene`, by the method of the module docstring, and of what
+    paths find beside it.
 
     Parameters
     ----------
     scene : the scene to trace.
     diffuse : its paints and lights.
     responses : R per filter, in the order of the filter index; e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹.
+    paths : trace light that bounces, and all light of other shapes; None where there is neither.
     """
 
     def __init__(
@@ -70,7 +73,7 @@ class DiffuseIntegrator:
         responses: Mapping[str, Spectrum],
         paths: PathIntegrator | None = None,
     ) -> None:
-        self._scene, self.paths = scene, paths
+        self._scene, self._paths = scene, paths
         #: Objects that compute e_k and draw a point, in the order of the scene's lights.
         self._lights = [light_source(scene.leaving, light) for light in diffuse.lights]
         irradiances = [light.level for light in diffuse.lights]
@@ -163,9 +166,9 @@ class DiffuseIntegrator:
             # outlines need these poses in all lanes, so surfaces and shadows may share them
             moment = scene.posed(moment, self._outlines.groups)
         flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
-        if self.paths is not None:
+        if self._paths is not None:
             flags = mi.RayFlags.All
-            ray.wavelengths = mi.UnpolarizedSpectrum(*self.paths.wavelengths.sample(filter_index, sampler.next_1d()))
+            ray.wavelengths = mi.UnpolarizedSpectrum(*self._paths.wavelengths.sample(filter_index, sampler.next_1d()))
         surface = scene.intersect(ray, moment, True, mi.Bool(True), flags)
         si, met = surface.rest, surface.met
         hit = si.is_valid()
@@ -225,11 +228,11 @@ class DiffuseIntegrator:
                 open_ = dr.select(blocked, 0.0, open_)
             unshadowed = dr.fma(scale, open_, unshadowed)
         bounced = None
-        if self.paths is not None:
+        if self._paths is not None:
             other = None
             if self._has_others:
                 other = hit & (dr.gather(mi.Float, self._rows, 4 * first + _ROW - 1, hit) > 0)
-            of_paths = self.paths, sampler, surface, ray, moment, filter_index
+            of_paths = self._paths, sampler, surface, ray, moment, filter_index
             bounced, near = bounced_flux(*of_paths, painted, other)
             met |= near
             controlled, plain, unshadowed = controlled + bounced, plain + bounced, unshadowed + bounced
