@@ -189,10 +189,32 @@ def test_objects_that_shine_are_seen_in_closed_form():
     (first, *_) = flux.flux_of_blocks(np.arange(16 * 12, dtype=np.uint32), flux.sample_blocks(1, 0, 1000))
     assert np.all(np.isfinite(np.array(first.half_a)))
     block = panel | {"shape": "box", "size_m": [0.1, 0.2, 0.02]}
-    assert build(mitsuba(), make_scene(objects=[*objects, block], camera=camera, light=light).spec).diffuse is None
     dark = [*objects, block | {"emission": {"luminance_cd_m2": 0}}]
     diffuse = build(mitsuba(), make_scene(objects=dark, camera=camera, light=light).spec).diffuse
     assert [each.kind for each in diffuse.lights] == ["ball", "ball", "sky"]
+
+
+@pytest.mark.parametrize("depth", [2, 4])
+def test_boxes_that_shine_and_maps_of_scene_files_are_seen_by_paths_beside_lamps(tmp_path, depth):
+    """A box, a ball of plastic and a printed lamp of a target that shine, under a lamp and a map of the sky."""
+    Image.fromarray(np.random.default_rng(5).integers(20, 250, (5, 8, 3), dtype=np.uint8)).save(tmp_path / "sky.png")
+    floor = {"name": "floor", "shape": "rectangle", "size_m": [1.2, 1.1, 0], "reflectance": 0.7}
+    block = {"name": "block", "shape": "box", "size_m": [0.1, 0.2, 0.02], "position_m": [-0.3, -0.1, 0.12]}
+    bead = {"name": "bead", "shape": "sphere", "size_m": [0.12] * 3, "position_m": [0.25, 0.1, 0.1]}
+    scene = make_scene(
+        objects=[floor, {**block, "reflectance": 0.4, "emission": {"luminance_cd_m2": 300, "illuminant": "A"}},
+                 {**bead, "material": {"type": "plastic"}, "emission": {"luminance_cd_m2": 150, "illuminant": "FL11"}}],
+        camera={"origin_m": [0.0, 0.05, 2], "target_m": [0.0, 0, 0], "horizontal_fov_deg": 22.62}, max_depth=depth,
+        light=[{"type": "area", "illuminant": "D50", "illuminance_lux": 400, "position_m": [0.5, 0.4, 1.3],
+                "size_m": [0.5, 0.3]},
+               {"type": "environment", "file": str(tmp_path / "sky.png"), "illuminance_lux": 250}],
+    )  # fmt: skip
+    diffuse, sensor = build(mitsuba(), scene.spec).diffuse, mono(60, 44)
+    assert list(diffuse.glows) == ["object_1", "object_2"] and diffuse.others == ["object_2"]
+    assert [light.kind for light in diffuse.lights] == ["rectangle"] and diffuse.more_lights == [0]
+    tracer = pair_tracer(scene, sensor)
+    assert tracer.has_bounced
+    assert_same(tracer, scene, sensor, rays=1024, most=20)
 
 
 def test_what_balls_give_is_what_rays_bring():
@@ -259,28 +281,63 @@ def changed(text, old, new):
 @pytest.mark.parametrize(
     "old, new",
     [
-        ('<shape type="cube" id="block">', '<shape type="cube" id="block"><emitter type="area"/>'),
-        ('<shape type="sphere" id="bulb">', '<shape type="sphere"><boolean name="flip_normals" value="true"/>'),
-        ('<scale x="-0.06" y="0.11"/>', '<scale x="-0.06" y="0.11"/><rotate z="1" angle="20"/><scale x="2"/>'),
-        ('<rgb name="radiance" value="0.6, 0.9, 0.7"/>', BITMAP.format("radiance", "")),
         ('<shape type="cube" id="block">', '<shape type="merge"><shape type="cube"/></shape><shape type="cube">'),
-        ('<emitter type="point">', '<emitter type="point"><float name="sampling_weight" value="0"/>'),
-        ('<emitter type="point"><point name="position" x="-0.4" y="0.3" z="0.7"/>', '<emitter type="spot">'),
         ('name="max_depth" value="2"', 'name="max_depth" value="1"'),
-        # surfaces of lamps
-        ('<ref id="clay"/></bsdf>', f'<bsdf type="diffuse">{RAW}</bsdf></bsdf>'),
-        (f'<bsdf type="diffuse" id="clay">{RED}</bsdf>', '<bsdf type="plastic" id="clay"/>'),
-        ('<ref id="clay"/></bsdf>', '<ref id="clay"/><ref id="spare"/></bsdf>'),
-        (RED, BITMAP.format("reflectance", '<transform name="to_uv"><scale x="0"/></transform>')),
-        (RED, '<texture type="mesh_attribute" name="reflectance"><string name="name" value="vertex_a"/></texture>'),
     ],
 )  # fmt: skip
-def test_light_that_has_no_closed_form_is_seen_by_paths(tmp_path, old, new):
+def test_what_is_not_known_of_surfaces_is_seen_by_paths(tmp_path, old, new):
     """One thing is changed in each case."""
     scene = loaded(tmp_path, changed(SCENE, old, new))
     assert build(mitsuba(), scene.spec).diffuse is None
     tracer = pair_tracer(scene, mono(8, 6))
     assert not (tracer.is_diffuse or tracer.has_bounced)
+
+
+@pytest.mark.parametrize(
+    "old, new, glows, others, more",
+    [
+        ('<shape type="cube" id="block">', '<shape type="cube" id="block"><emitter type="area"/>', {"block": 1}, 0, 0),
+        ('<shape type="sphere" id="bulb">',
+         '<shape type="sphere" id="bulb"><boolean name="flip_normals" value="true"/>', {"bulb": 1}, 0, 0),
+        ('<scale x="-0.06" y="0.11"/>', '<scale x="-0.06" y="0.11"/><rotate z="1" angle="20"/><scale x="2"/>',
+         {"lamp": 1}, 0, 0),
+        ('<rgb name="radiance" value="0.6, 0.9, 0.7"/>', BITMAP.format("radiance", ""), {"panel": 0}, 0, 0),
+        ('<emitter type="area"><rgb', '<emitter type="area"><float name="sampling_weight" value="0.3"/><rgb',
+         {"panel": 1}, 0, 0),
+        ('<emitter type="point">', '<emitter type="point"><float name="sampling_weight" value="0"/>', {}, 0, [0]),
+        ('<emitter type="point"><point name="position" x="-0.4" y="0.3" z="0.7"/>', '<emitter type="spot">',
+         {}, 0, [0]),
+        ('<emitter type="constant"><spectrum name="radiance" value="0.13"/></emitter>',
+         '<emitter type="envmap"><string name="filename" value="colour.png"/></emitter>', {}, 0, [1]),
+        # surfaces of lamps
+        ('<ref id="clay"/></bsdf>', f'<bsdf type="diffuse">{RAW}</bsdf></bsdf>', {"lamp": 1}, 1, 0),
+        ('<ref id="clay"/></bsdf>', '<ref id="clay"/><ref id="spare"/></bsdf>', {"lamp": 1}, 1, 0),
+        (f'<bsdf type="diffuse" id="clay">{RED}</bsdf>', '<bsdf type="plastic" id="clay"/>', {"lamp": 1}, 2, 0),
+        (RED, BITMAP.format("reflectance", '<transform name="to_uv"><scale x="0"/></transform>'), {"lamp": 1}, 2, 0),
+        (RED, '<texture type="mesh_attribute" name="reflectance"><string name="name" value="vertex_a"/></texture>',
+         {"lamp": 1}, 2, 0),
+    ],
+)  # fmt: skip
+def test_light_that_has_no_closed_form_is_seen_by_paths(tmp_path, old, new, glows, others, more):
+    """One thing is changed in each case."""
+    scene = loaded(tmp_path, changed(SCENE, old, new))
+    diffuse = build(mitsuba(), scene.spec).diffuse
+    assert {name: radiance is not None for name, radiance in diffuse.glows.items()} == glows
+    assert diffuse.more_lights == (more or []) and len(diffuse.others) == others
+    lamps = {"lamp", "panel", "bulb"} - glows.keys()
+    assert {light.shape for light in diffuse.lights if light.shape is not None} == lamps
+    assert len(diffuse.lights) == len(lamps) + 3 - len(diffuse.more_lights)
+    tracer = pair_tracer(scene, mono(8, 6))
+    assert tracer.has_bounced and not tracer.is_diffuse
+
+
+def test_a_scene_whose_lights_all_lack_a_closed_form_is_seen_by_paths(tmp_path):
+    text = (
+        '<scene version="3.0.0"><shape type="sphere"/><emitter type="envmap">'
+        '<string name="filename" value="colour.png"/></emitter></scene>'
+    )
+    scene = loaded(tmp_path, text)
+    assert build(mitsuba(), scene.spec).diffuse is None
 
 
 @pytest.mark.parametrize(
@@ -328,6 +385,43 @@ def test_gloss_and_what_bounces_are_seen_by_paths_beside_closed_forms(tmp_path, 
     tracer = pair_tracer(scene, sensor)
     assert build(mitsuba(), scene.spec).diffuse.others == ["gloss", "mirror", "veil"]
     assert tracer.has_bounced and not tracer.is_diffuse
+    assert_same(tracer, scene, sensor, rays=1024, most=20)
+
+
+#: Lights without a closed form: a map of the sky, a spot, a block, a disk with a picture, and a ball of plastic that
+#: shine; and a hair.
+MORE = """
+  <emitter type="envmap"><string name="filename" value="colour.png"/><float name="scale" value="0.25"/>
+    <transform name="to_world"><rotate x="1" angle="70"/></transform></emitter>
+  <emitter type="spot"><transform name="to_world"><lookat origin="0.3, -0.4, 0.5" target="0.1, 0, 0" up="0, 1, 0"/>
+    </transform><rgb name="intensity" value="0.3, 0.25, 0.2"/><float name="cutoff_angle" value="14"/></emitter>
+  <shape type="cube" id="glow"><transform name="to_world">
+      <scale x="0.03" y="0.02" z="0.02"/><rotate z="1" angle="50"/><translate x="0.05" y="0.12" z="0"/></transform>
+    <emitter type="area"><rgb name="radiance" value="0.9, 0.7, 0.3"/></emitter></shape>
+  <shape type="disk" id="screen"><transform name="to_world">
+      <scale x="0.06" y="0.05"/><rotate y="1" angle="40"/><translate x="-0.25" y="-0.02" z="0.08"/></transform>
+    <emitter type="area"><texture type="bitmap" name="radiance"><string name="filename" value="colour.png"/></texture>
+    </emitter></shape>
+  <shape type="sphere" id="bead"><point name="center" x="0.17" y="0.03" z="0.02"/><float name="radius" value="0.03"/>
+    <bsdf type="plastic"/><emitter type="area"><rgb name="radiance" value="0.2, 0.3, 0.4"/></emitter></shape>
+  <shape type="linearcurve" id="hair"><string name="filename" value="hair.txt"/><ref id="clay"/></shape>
+</scene>"""
+
+
+@pytest.mark.parametrize("depth", [2, 5])
+@pytest.mark.parametrize("lamps", [True, False])
+def test_lights_without_a_closed_form_are_seen_by_paths_beside_others(tmp_path, depth, lamps):
+    """Against Mitsuba's own path tracer, with many lights of closed form and with the point light alone."""
+    (tmp_path / "hair.txt").write_text("-0.2 0.2 0.02 0.008\n0.0 0.23 0.06 0.008\n0.2 0.2 0.03 0.008\n")
+    text = SCENE.replace('"max_depth" value="2"', f'"max_depth" value="{depth}"')
+    text = text.replace('<emitter type="constant"><spectrum name="radiance" value="0.13"/></emitter>', "")
+    off = [] if lamps else ["lamp", "panel", "bulb"]
+    scene = loaded(tmp_path, text.replace("</scene>", MORE), unlit=off)
+    diffuse, sensor = build(mitsuba(), scene.spec).diffuse, hr.load_sensor("gen2").crop(60, 44, 1400, 1000)
+    assert list(diffuse.glows) == ["glow", "screen", "bead"] and diffuse.others == ["bead"]
+    assert diffuse.more_lights == [2, 3] and "hair" in {paint.shape for paint in diffuse.paints}
+    tracer = pair_tracer(scene, sensor)
+    assert tracer.has_bounced
     assert_same(tracer, scene, sensor, rays=1024, most=20)
 
 

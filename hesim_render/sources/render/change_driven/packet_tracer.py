@@ -131,7 +131,7 @@ class PacketTracer(Tracer):
         (depth, roulette), diffuse = path_depths(self.built.integrator), self.built.diffuse
         self.paths: PathIntegrator | None = None
         self._direct: DiffuseIntegrator | None = None
-        if diffuse is None or diffuse.others or depth != 2:
+        if diffuse is None or diffuse.needs_paths or depth != 2:
             self.paths = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))
         if diffuse is not None:
             self._direct = DiffuseIntegrator(self.parts, diffuse, self.sensor.responses, self.paths)

@@ -63,8 +63,8 @@ class BuiltScene:
     groups : movable shapes by name: ``target``, an object's name, a Mitsuba shape id.
     trajectories : tracks of the groups that really move.
     is_dark : True where nothing emits.
-    diffuse : diffuse surfaces and lights, if the direct light of all lights has a closed form; otherwise None. What
-        traces the scene takes it, because pictures in it are large.
+    diffuse : diffuse surfaces and lights, if the direct light of one has a closed form; otherwise None. What traces the
+        scene takes it, because pictures in it are large.
     exact_because : why the scene needs the exact mode; None if it does not.
     camera : the Mitsuba scene's own camera, if it is used.
     integrator_plugin : plugin description of a Mitsuba scene's integrator; None if it was given as an object.
@@ -211,12 +211,11 @@ def _fits(diffuse: DiffuseScene | None, responses: Mapping[str, Spectrum] | None
 def _describe(
     mi: MitsubaModule, spec: SceneSpec
 ) -> tuple[dict[str, Any], dict[str, list[str]], DiffuseScene | None, dict[str, Deformation]]:
-    """Mitsuba's dictionary of a scene file, the shape ids of each movable name, surfaces and lights (None if a shape
-    is not diffuse, or shines and has no closed form), and the objects that change their shape.
+    """Mitsuba's dictionary of a scene file, the shape ids of each movable name, surfaces and lights (None if no light
+    has a closed form), and the objects that change their shape.
     """
     deformations: dict[str, Deformation] = {}
-    all_diffuse = True
-    others: list[str] = []
+    others, glows = list[str](), dict[str, Spectrum | None]()
     content: dict[str, Any] = {}
     groups: dict[str, list[str]] = {}
     paints: list[Paint] = []
@@ -228,8 +227,8 @@ def _describe(
             content[name] = _piece(mi, name, piece)
             groups["target"].append(name)
             if piece.radiance is not None:
-                all_diffuse = False
-            elif isinstance(piece.reflectance, Picture):
+                glows[name] = piece.radiance
+            if isinstance(piece.reflectance, Picture):
                 paints.append(pictured(name, piece.reflectance))
             else:
                 paints.append(Paint(name, (piece.reflectance,)))
@@ -246,21 +245,24 @@ def _describe(
             parts = {name: _object(mi, item, name, placement, bsdf)}
         content.update(parts)
         groups[item.name] = list(parts)
-        light = _shining(item, name, placement)
-        if is_diffuse(item) and (light is not None or radiance_of(item) is None):
+        radiance, light = radiance_of(item), _shining(item, name, placement)
+        if light is not None and is_diffuse(item):
+            shining.append(light)
+        elif radiance is not None:
+            glows.update(dict.fromkeys(parts, radiance))
+        if is_diffuse(item):
             paints += [paint_of(item, part, picture) for part in parts]
-            shining += [] if light is None else [light]
-        elif radiance_of(item) is None:
-            others += list(parts)
         else:
-            all_diffuse = False
+            others += list(parts)
     try:
-        content.update(lights.emitters(mi, spec.lights))
+        sources = lights.emitters(mi, spec.lights)
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
-    has_map = any(light.type == "environment" for light in spec.lights)
-    diffuse = DiffuseScene(paints, direct_lights(spec.lights, shining), others) if all_diffuse and not has_map else None
-    return content, groups, diffuse, deformations
+    content.update(sources)
+    apart = [source for source in sources.values() if source["type"] != "rectangle"]
+    more = [number for number, source in enumerate(apart) if source["type"] == "envmap"]
+    diffuse = DiffuseScene(paints, direct_lights(spec.lights, shining), others, glows, more)
+    return content, groups, diffuse if diffuse.lights or not (glows or more) else None, deformations
 
 
 def _without_normals(item: ObjectSpec, spec: SceneSpec, groups: Mapping[str, list[str]]) -> list[str]:

@@ -42,7 +42,8 @@ class DirectLight:
 
 
 def direct_lights(given: Sequence[LightSpec], shining: Sequence[DirectLight] = ()) -> list[DirectLight]:
-    """Lights of a scene file that are on, and objects that shine; all uniform lights are one sky, which comes last.
+    """Lights of a scene file that are on and have a closed form, and objects that shine; all uniform lights are one
+    sky, which comes last.
 
     Raises
     ------
@@ -53,7 +54,7 @@ def direct_lights(given: Sequence[LightSpec], shining: Sequence[DirectLight] = (
     skies: list[Spectrum] = []
     for number, light in enumerate(given):
         level = irradiance(light)
-        if level is None:
+        if level is None or light.type == "environment":
             continue
         if light.type == "uniform":
             skies.append(level)

@@ -11,14 +11,10 @@ from numpy.typing import NDArray
 
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
-from hesim_render.sources.render.scene.diffuse_scene import (
-    DiffuseScene,
-    ParsedDiffuseScene,
-    loaded_diffuse_scene,
-    parsed_diffuse_scene,
-)
+from hesim_render.sources.render.scene.diffuse_scene import DiffuseScene, loaded_diffuse_scene
 from hesim_render.sources.render.scene.files import require_short_number
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, box_corners, matrix_of, transform
+from hesim_render.sources.render.scene.parsed_diffuse import ParsedDiffuseScene, parsed_diffuse_scene
 from hesim_render.sources.render.scene.parsed_scene import load_mitsuba_scene, switch_off
 from hesim_render.sources.render.scene.plugin_tables import require_known
 from hesim_render.sources.render.scene.plugins import (

@@ -36,6 +36,7 @@ from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.diffuse_scene import DiffuseScene
 from hesim_render.sources.render.scene.pictures import TextureData
 from hesim_render.sources.render.transport.bounced import bounced_flux
+from hesim_render.sources.render.transport.known_lights import KnownTable, number_of
 from hesim_render.sources.render.transport.light_sources import BallLamp, RectangleLamp, Sky, light_source
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.occluded_lamps import SLOTS, LampShadows
@@ -47,8 +48,8 @@ from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product
 from hesim_render.targets.piece import Picture
 
 #: Columns of a shape's row in the table of paints: number of its one or two colours, how many of its sides are painted,
-#: number of its lamp from 1, the scale of its checks or picture, the number of its picture from 1, and 1 for a shape
-#: that is not diffuse.
+#: number of its lamp from 1, or -1 if paths see what it emits, the scale of its checks or picture, the number of its
+#: picture from 1, and 1 for a shape that is not diffuse.
 _ROW = 8
 #: Row of a shape without paint: its front is black.
 _BLACK = (0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0)
@@ -63,7 +64,8 @@ class DiffuseIntegrator:
     scene : the scene to trace.
     diffuse : its paints and lights.
     responses : R per filter, in the order of the filter index; e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹.
-    paths : trace light that bounces, and all light of other shapes; None where there is neither.
+    paths : trace light that bounces, that of lights without a closed form, and all light of other shapes; None where
+        there is none.
     """
 
     def __init__(
@@ -78,8 +80,10 @@ class DiffuseIntegrator:
         self._lights = [light_source(scene.leaving, light) for light in diffuse.lights]
         irradiances = [light.level for light in diffuse.lights]
         # a ray that hits the light itself carries its strength
-        strengths = [light.strength for light in diffuse.lights]
-        lamp_of = {light.shape: number for number, light in enumerate(diffuse.lights) if light.shape is not None}
+        even = {shape: radiance for shape, radiance in diffuse.glows.items() if radiance is not None}
+        strengths = [*(light.strength for light in diffuse.lights), *even.values()]
+        shining = [*(light.shape for light in diffuse.lights), *even]
+        lamp_of = {shape: number for number, shape in enumerate(shining) if shape is not None}
         self._has_sky = bool(diffuse.lights) and diffuse.lights[-1].kind == "sky"
         self._outlines = OccludedSky(scene) if self._has_sky else None
         self._shadows = LampShadows(scene) if any(light.kind == "rectangle" for light in diffuse.lights) else None
@@ -95,11 +99,20 @@ class DiffuseIntegrator:
             if paint.picture is not None:
                 own = pictures.setdefault((paint.picture, paint.repeats), len(pictures) + 1)
             rows[paint.shape] = [numbers[0], numbers[-1], 1.0 + paint.two_sided, 0.0, *paint.scale, own, 0.0]
-        for shape, number in lamp_of.items():
-            rows.setdefault(shape, [0.0] * _ROW)[3] = number + 1.0
         for shape in diffuse.others:
             rows[shape] = [0.0] * (_ROW - 1) + [1.0]
+        for shape, number in lamp_of.items():
+            rows.setdefault(shape, [0.0] * _ROW)[3] = number + 1.0
+        for shape in diffuse.glows.keys() - even.keys():
+            rows.setdefault(shape, [0.0] * _ROW)[3] = -1.0
         self._has_others = bool(diffuse.others)
+        # what else shines: a picture of the sky, and shapes that do not shine evenly
+        self._has_map = scene.has_sky and not self._has_sky
+        self._has_unknown = self._has_map or len(even) < len(diffuse.glows)
+        self._known: KnownTable | None = None
+        if diffuse.glows or diffuse.more_lights:
+            lamps = {light.shape for light in diffuse.lights if light.shape is not None}
+            self._known = KnownTable(scene, lamps, diffuse.more_lights)
         self._has_checks = any(len(paint.colours) > 1 for paint in diffuse.paints)
         self._tables(rows, colours, irradiances, strengths, list(responses.values()))
         of_lights = irradiances, list(responses.values())
@@ -119,10 +132,7 @@ class DiffuseIntegrator:
         (light, filter).
         """
         mi = self._scene.mi
-        numbers = {}
-        for name, shape in self._scene.shapes.items():
-            number: UInt32 = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
-            numbers[int(number[0])] = rows.get(name, _BLACK)
+        numbers = {number_of(mi, shape): rows.get(name, _BLACK) for name, shape in self._scene.shapes.items()}
         rows_of = np.zeros((max(numbers, default=0) + 1, _ROW))
         for place, row in numbers.items():
             rows_of[place] = row
@@ -190,6 +200,8 @@ class DiffuseIntegrator:
         lights_beside_sky = len(self._lights) - self._has_sky
         source = dr.select(hit, mi.UInt32(dr.maximum(lamp - 1, 0)), mi.UInt32(lights_beside_sky))
         seen = dr.gather(mi.Float, self._emitted, source * self._filters + filter_index, emits)
+        if self._has_unknown and self._paths is not None:
+            seen += self._paths.seen(si, dr.select(hit, lamp < 0, self._has_map), filter_index)
 
         # light that a painted surface reflects
         painted = hit & (front & (sides > 0) | (sides > 1))
@@ -232,8 +244,9 @@ class DiffuseIntegrator:
             other = None
             if self._has_others:
                 other = hit & (dr.gather(mi.Float, self._rows, 4 * first + _ROW - 1, hit) > 0)
+            known = None if self._known is None else self._known.where(painted)
             of_paths = self._paths, sampler, surface, ray, moment, filter_index
-            bounced, near = bounced_flux(*of_paths, painted, other)
+            bounced, near = bounced_flux(*of_paths, painted, other, known)
             met |= near
             controlled, plain, unshadowed = controlled + bounced, plain + bounced, unshadowed + bounced
         # known shadows are known in all windows, so there is no choice

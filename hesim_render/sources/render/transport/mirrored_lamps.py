@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.device import dr
-from hesim_render.core.device_types import Float, Mask, MitsubaModule, MitsubaObject, Point2, Point3, Vector3
+from hesim_render.core.device_types import Bands, Float, Mask, MitsubaModule, MitsubaObject, Point2, Point3, Vector3
 from hesim_render.sources.render.scene.mitsuba_version import mesh_faces, mesh_vertices
+from hesim_render.sources.render.transport.moving_scene import Surface
 
 #: Part of the directions that is drawn from all images together. In a scene with floor, mirror and three other objects
 #: 0.03 to 0.1 had the same noise within a tenth, 0.3 had more.
@@ -164,3 +165,32 @@ def _mirror(mi: MitsubaModule, shape: MitsubaObject) -> tuple[NDArray[np.float64
     if np.ptp(heights) > _FLAT * size:
         return None
     return normal, float(heights.mean())
+
+
+def redirected(
+    bsdf: MitsubaObject,
+    context: MitsubaObject,
+    surface: Surface,
+    cones: Cones,
+    choice: Float,
+    place: Point2,
+    chosen: Mask,
+    weight: Bands,
+) -> Bands:
+    """Weight of a surface sample if some samples are drawn from cones; writes the sampled direction into `chosen`
+    lanes.
+    """
+    import mitsuba as mi
+
+    direction, drawn = cones.sample(choice, place)
+    towards = surface.to_local(direction)
+    value, pdf = bsdf.eval_pdf(context, surface.rest, towards, drawn)
+    delta = ~drawn & mi.has_flag(chosen.sampled_type, mi.BSDFFlags.Delta)
+    own, pdf = 1 - cones.chance, dr.select(drawn, pdf, chosen.pdf)
+    mixed = dr.fma(own, pdf, cones.density(dr.select(drawn, direction, surface.to_world(chosen.wo))))
+    weight = dr.select(drawn, value / mixed, weight * dr.select(delta, dr.rcp(own), pdf / mixed))
+    chosen.wo = dr.select(drawn, towards, chosen.wo)
+    chosen.pdf = dr.select(delta, chosen.pdf, mixed)
+    chosen.eta = dr.select(drawn, 1.0, chosen.eta)
+    chosen.sampled_type = dr.select(drawn, +mi.BSDFFlags.DiffuseReflection, chosen.sampled_type)
+    return dr.select(mixed > 0, weight, 0.0)

@@ -150,9 +150,10 @@ class MovingScene:
             if shape.is_emitter() and not geometry_only:
                 raise NeedsExactMode(f"{group!r} moves and emits light")
             parts[group][f"shape_{number}"] = shape
-        emitters = built.scene.emitters()
-        spare_even_skies(mi, emitters)
-        for number, emitter in enumerate(emitters):
+        #: All lights, in the order of the loaded scene.
+        self.lights = built.scene.emitters()
+        spare_even_skies(mi, self.lights)
+        for number, emitter in enumerate(self.lights):
             if emitter.get_shape() is None:
                 resting[f"emitter_{number}"] = emitter
         if any(shape.class_name() == "Instance" for shape in built.scene.shapes()):
@@ -165,10 +166,9 @@ class MovingScene:
             self.static = built.scene
         else:
             self.static = mi.load_dict({"type": "scene", **resting}, optimize=False)
-        lights = self.static.emitters()
         #: Lights that a ray can hit: the environment, and corners of boxes around all other lights [n, 2, 3], m.
-        self.has_sky = any(light.is_environment() for light in lights)
-        boxes = [light.get_shape().bbox() for light in lights if light.get_shape() is not None]
+        self.has_sky = any(light.is_environment() for light in self.lights)
+        boxes = [light.get_shape().bbox() for light in self.lights if light.get_shape() is not None]
         self.lamp_boxes = np.array([[box.min, box.max] for box in boxes], dtype=np.float64).reshape(-1, 2, 3)
         #: What begins the rays that leave surfaces.
         self.leaving = Leaving(mi, built.scene)

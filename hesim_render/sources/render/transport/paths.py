@@ -24,7 +24,8 @@ from hesim_render.core.device_types import (
     UInt32,
 )
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
-from hesim_render.sources.render.transport.mirrored_lamps import Cones, LampImages
+from hesim_render.sources.render.transport.known_lights import KnownLights
+from hesim_render.sources.render.transport.mirrored_lamps import LampImages, redirected
 from hesim_render.sources.render.transport.moving_scene import MovingScene, Surface
 from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows, inverse_of, meets_box
 
@@ -44,12 +45,14 @@ class Begun:
     active : lanes that have one.
     density : of the direction in which the path goes on. With a density of 0, what the second vertex emits is left out.
     is_delta : True where this direction was the only one.
+    known : lights of which what the second vertex emits is left out; None for none.
     """
 
     vertex: Interaction
     active: Mask
     density: Float
     is_delta: Mask
+    known: KnownLights | None = None
 
 
 class PathIntegrator:
@@ -131,13 +134,18 @@ class PathIntegrator:
             before_pdf, before_delta = mi.Float(begun.density), mi.Bool(begun.is_delta)
         most, roulette_depth = (dr.opaque(mi.UInt32, depth) for depth in (self._max_depth, self._roulette_depth))
 
+        def left_out(depth: UInt32) -> KnownLights | None:
+            """Lights of which what a vertex itself emits is left out."""
+            known = None if begun is None else begun.known
+            return known and known.among(depth == 1)
+
         def step(*state: Any) -> LoopState:
             """One vertex from which the path may continue. The last segment is handled after the loop."""
             sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active, _ = state
             surface = scene.intersect(ray, moment, depth == 0, active)
             si = surface.rest
             met |= surface.met
-            shine = self.shine(si, active, before, before_pdf, before_delta)
+            shine = self.shine(si, active, before, before_pdf, before_delta, left_out(depth))
             radiance = dr.fma(throughput, shine, radiance)
 
             goes_on = active & si.is_valid()
@@ -177,7 +185,7 @@ class PathIntegrator:
             end = step(*state) if begun is None else state
         else:
             end = dr.while_loop(state, lambda *values: values[-2], step, label="paths")
-        _, depth, met, throughput, radiance, _, *before, ray, _, left = end
+        _, depth, met, throughput, radiance, _, before, before_pdf, before_delta, ray, _, left = end
 
         # the last segment contributes only if it hits a light
         if not (scene.has_sky or self._lamps):
@@ -193,9 +201,24 @@ class PathIntegrator:
             si.wi, si.wavelengths = -ray.d, ray.wavelengths
         met |= left & near
         # the throughput of a path that has ended is undefined
-        return dr.select(left, dr.fma(throughput, self.shine(si, left, *before), radiance), radiance), met
+        shine = self.shine(si, left, before, before_pdf, before_delta, left_out(depth))
+        return dr.select(left, dr.fma(throughput, shine, radiance), radiance), met
 
-    def shine(self, si: Interaction, active: Mask, before: Interaction, pdf: Float, delta: Mask) -> Bands:
+    def seen(self, si: Interaction, active: Mask, filter_index: UInt32) -> Float:
+        """Flux of what surfaces themselves emit that rays from the camera hit, e⁻/s; see `shine`."""
+        mi = self.scene.mi
+        radiance = self.shine(si, active, dr.zeros(mi.Interaction3f), mi.Float(1.0), mi.Bool(True))
+        return dr.sum(radiance) / len(radiance) * self.wavelengths.total(filter_index)
+
+    def shine(
+        self,
+        si: Interaction,
+        active: Mask,
+        before: Interaction,
+        pdf: Float,
+        delta: Mask,
+        known: KnownLights | None = None,
+    ) -> Bands:
         """Light that a hit surface itself emits, with its weight against sampling of lights.
 
         Parameters
@@ -203,12 +226,17 @@ class PathIntegrator:
         si, active : the surface, and lanes that count.
         before : vertex before it.
         pdf, delta : density of the direction that led to it, and True where this was the only one.
+        known : lights that are left out; None for none.
         """
         mi, static = self.scene.mi, self.scene.static
         light = si.emitter(static, active)
         shines = active & (light != None)  # noqa: E711  (a Dr.Jit comparison)
+        if known is not None:
+            shines &= ~known.has(light)
         seen = mi.DirectionSample3f(static, si, before)
         light_pdf = static.pdf_emitter_direction(before, seen, shines & ~delta)
+        if known is not None:
+            light_pdf *= known.density
         share = dr.select(delta, 1.0, power_heuristic(pdf, light_pdf))
         return dr.select(shines, light.eval(si, shines) * share, 0.0)
 
@@ -220,6 +248,7 @@ class PathIntegrator:
         may_follow: Mask,
         numbers: tuple[Point2, Float, Point2],
         asks: Mask | bool = True,
+        known: KnownLights | None = None,
     ) -> tuple[Bands, MitsubaObject, Bands, Mask]:
         """Light of one lamp that a vertex reflects, and the direction in which the path goes on.
 
@@ -230,6 +259,7 @@ class PathIntegrator:
         may_follow : lanes with two segments or more to go.
         numbers : random numbers `place`, `lobe` and `light`, see `CounterSampler.next_vertex`.
         asks : lanes in which a lamp is sampled; False for none, where all surfaces are diffuse.
+        known : lights that are left out; None for none.
 
         Returns
         -------
@@ -247,7 +277,12 @@ class PathIntegrator:
 
         # sample a light from this vertex
         asks = goes_on & asks & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        seen, weight = scene.static.sample_emitter_direction(surface.world, light, False, asks)
+        drawn = light if known is None else mi.Point2f(known.drawn(light.x), light.y)
+        seen, weight = scene.static.sample_emitter_direction(surface.world, drawn, False, asks)
+        if known is not None:
+            asks &= ~known.has(seen.emitter)
+            seen.pdf *= known.density
+            weight /= known.density
         asks &= seen.pdf != 0
         shadow = scene.leaving.to(surface.world, seen.p)
         infinite = mi.has_flag(seen.emitter.flags(), mi.EmitterFlags.Infinite)
@@ -270,7 +305,7 @@ class PathIntegrator:
         value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(context, si, towards, lobe, place, goes_on)
         if self._images:
             pdf = dr.fma(1 - cones.chance, pdf, cones.density(seen.d))
-            chosen_weight = _redirected(bsdf, context, surface, cones, choice, place, chosen, chosen_weight)
+            chosen_weight = redirected(bsdf, context, surface, cones, choice, place, chosen, chosen_weight)
         value = si.to_world_mueller(value, -towards, si.wi)
         share = dr.select(seen.delta, 1.0, power_heuristic(seen.pdf, pdf))
         chosen_weight = si.to_world_mueller(chosen_weight, -chosen.wo, si.wi)
@@ -282,35 +317,6 @@ class PathIntegrator:
         for box in self._lamps:
             near |= meets_box(ray, inverse, dr.inf, box)
         return near
-
-
-def _redirected(
-    bsdf: MitsubaObject,
-    context: MitsubaObject,
-    surface: Surface,
-    cones: Cones,
-    choice: Float,
-    place: Point2,
-    chosen: Mask,
-    weight: Bands,
-) -> Bands:
-    """Weight of a surface sample if some samples are drawn from cones; writes the sampled direction into `chosen`
-    lanes.
-    """
-    import mitsuba as mi
-
-    direction, drawn = cones.sample(choice, place)
-    towards = surface.to_local(direction)
-    value, pdf = bsdf.eval_pdf(context, surface.rest, towards, drawn)
-    delta = ~drawn & mi.has_flag(chosen.sampled_type, mi.BSDFFlags.Delta)
-    own, pdf = 1 - cones.chance, dr.select(drawn, pdf, chosen.pdf)
-    mixed = dr.fma(own, pdf, cones.density(dr.select(drawn, direction, surface.to_world(chosen.wo))))
-    weight = dr.select(drawn, value / mixed, weight * dr.select(delta, dr.rcp(own), pdf / mixed))
-    chosen.wo = dr.select(drawn, towards, chosen.wo)
-    chosen.pdf = dr.select(delta, chosen.pdf, mixed)
-    chosen.eta = dr.select(drawn, 1.0, chosen.eta)
-    chosen.sampled_type = dr.select(drawn, +mi.BSDFFlags.DiffuseReflection, chosen.sampled_type)
-    return dr.select(mixed > 0, weight, 0.0)
 
 
 def power_heuristic(a: Float, b: Float) -> Float:
