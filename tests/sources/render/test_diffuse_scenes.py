@@ -11,7 +11,7 @@ import hesim_render as hr
 from hesim_render.core.device import dr
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.windows import Windows
-from hesim_render.sources.render.scene import surfaces
+from hesim_render.sources.render.scene import diffuse_scene, surfaces
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.direct_lights import DirectLight
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba, names_of
@@ -329,6 +329,67 @@ def test_light_that_has_no_closed_form_is_seen_by_paths(tmp_path, old, new, glow
     assert len(diffuse.lights) == len(lamps) + 3 - len(diffuse.more_lights)
     tracer = pair_tracer(scene, mono(8, 6))
     assert tracer.has_bounced and not tracer.is_diffuse
+
+
+QUAD = "v -0.1 0.04 0.2\nv -0.06 0.01 0.26\nv 0.02 0.07 0.2366667\nv -0.02 0.1 0.1766667\n"
+
+
+@pytest.mark.parametrize(
+    "mesh, is_lamp",
+    [
+        (QUAD + "f 1 2 3 4\n", True),
+        # corners twice, and the same sides with the other diagonal
+        (QUAD + QUAD + "f 6 3 8\nf 6 4 1\n", True),
+        (QUAD + "f 1 4 3 2\n", True),
+        (QUAD + "f 1 2 3\n", False),
+        (QUAD + "v 0 0.1 0.2\nf 1 2 3\nf 1 3 5\n", False),
+        # a parallelogram
+        (QUAD.replace("0.2366667", "0.25").replace("0.1766667", "0.19") + "f 1 2 3 4\n", False),
+        (QUAD.replace("0.1766667", "0.18") + "f 1 2 3 4\n", False),
+        (QUAD + "vn 0.1 0 1\nvn 0 0.1 1\nvn 0 0 1\nf 1//1 2//2 3//3 4//3\n", False),
+    ],
+)  # fmt: skip
+def test_meshes_that_are_rectangles_shine_in_closed_form(tmp_path, mesh, is_lamp):
+    """By hand: sides of 0.04, -0.03, 0.06 and 0.08, 0.06, -0.0233, which are at right angles."""
+    (tmp_path / "quad.obj").write_text(mesh)
+    shape = '<shape type="obj" id="quad"><string name="filename" value="quad.obj"/>'
+    emitter = '<emitter type="area"><rgb name="radiance" value="2, 1, 0.5"/></emitter></shape></scene>'
+    diffuse = build(mitsuba(), loaded(tmp_path, SCENE.replace("</scene>", shape + emitter)).spec).diffuse
+    lamps = [light for light in diffuse.lights if light.shape == "quad"]
+    assert len(lamps) == is_lamp and list(diffuse.glows) == ([] if is_lamp else ["quad"])
+    if is_lamp:
+        (frame,) = (lamp.place for lamp in lamps)
+        np.testing.assert_allclose(frame[:3, 3], [-0.04, 0.055, 0.2183333], atol=1e-6)
+        sides = {tuple(np.round(sign * side, 6)) for side in frame[:3, :2].T for sign in (1, -1)}
+        assert {(0.02, -0.015, 0.03), (0.04, 0.03, -0.011667)} <= sides
+        np.testing.assert_allclose(
+            np.linalg.det(frame[:3, :3]), np.prod(np.linalg.norm(frame[:3, :2], axis=0)), rtol=1e-5
+        )
+        upwards = "f 1 4" not in mesh
+        assert (frame[2, 2] > 0) == upwards
+
+
+def test_a_mesh_that_is_a_rectangle_gives_the_light_that_mitsuba_gives(tmp_path):
+    (tmp_path / "quad.obj").write_text(QUAD + "f 1 4 3 2\n")
+    shape = '<shape type="obj" id="quad"><string name="filename" value="quad.obj"/><ref id="clay"/>'
+    emitter = '<emitter type="area"><rgb name="radiance" value="12, 9, 5"/></emitter></shape></scene>'
+    scene, sensor = loaded(tmp_path, SCENE.replace("</scene>", shape + emitter)), mono(60, 44)
+    tracer = pair_tracer(scene, sensor)
+    assert tracer.is_diffuse
+    assert_same(tracer, scene, sensor, rays=1024)
+
+
+def test_more_lights_than_a_kernel_holds_are_seen_by_paths(tmp_path, monkeypatch):
+    monkeypatch.setattr(diffuse_scene, "_MOST_LIGHTS", 4)
+    diffuse = build(mitsuba(), loaded(tmp_path).spec).diffuse
+    assert [light.kind for light in diffuse.lights] == ["rectangle", "rectangle", "ball", "point"]
+    assert diffuse.more_lights == [2, 1] and not diffuse.glows
+    monkeypatch.setattr(diffuse_scene, "_MOST_LIGHTS", 1)
+    scene, sensor = loaded(tmp_path), mono(60, 44)
+    diffuse, tracer = build(mitsuba(), scene.spec).diffuse, pair_tracer(scene, sensor)
+    assert list(diffuse.glows) == ["panel", "bulb"] and diffuse.more_lights == [0, 2, 1]
+    assert tracer.has_bounced
+    assert_same(tracer, scene, sensor, rays=1024, most=20)
 
 
 def test_a_scene_whose_lights_all_lack_a_closed_form_is_seen_by_paths(tmp_path):

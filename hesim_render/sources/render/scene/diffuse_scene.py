@@ -16,16 +16,17 @@ from hesim_render.core.device_types import Bands, Interaction, MitsubaModule, Mi
 from hesim_render.core.errors import SpecError
 from hesim_render.core.host_arrays import from_host
 from hesim_render.sources.render.scene.direct_lights import DirectLight
+from hesim_render.sources.render.scene.lamp_frames import lamp_frame
 from hesim_render.sources.render.scene.mitsuba_version import ball_of, matrix_of, names_of
 from hesim_render.sources.render.scene.parsed_diffuse import ParsedDiffuseScene, ParsedPaint
 from hesim_render.sources.render.scene.pictures import TextureData
 from hesim_render.sources.render.scene.surfaces import Paint
 from hesim_render.spectral.spectrum import RENDERABLE_NM, Spectrum, constant
 
-#: Largest cosine between the sides of a rectangle.
-_RIGHT_ANGLED = 1e-5
 #: Distance of a spectrum's first and last sample from the zeros next to them, nm.
 _JUMP_NM = 1e-3
+#: Largest number of lights in closed form: a kernel takes each of them for every ray.
+_MOST_LIGHTS = 64
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,9 @@ def _read(
         picture = reader.picture(shape, paint)
         is_ball = shape.class_name() == "Sphere"
         is_other = paint.texture == "other" or (paint.texture == "picture" and picture is None)
-        # a rectangle without right angles has no closed form
-        place = None if paint.light != "lamp" or is_other else ball_of(shape) if is_ball else reader.frame(shape)
+        place = None
+        if paint.light == "lamp" and not is_other and len(result.lights) < _MOST_LIGHTS:
+            place = ball_of(shape) if is_ball else lamp_frame(reader.mi, shape)
         if place is not None:
             own = reader.radiance(shape), 1.0, place, name
             result.lights.append(DirectLight("ball", *own) if is_ball else DirectLight("rectangle", *own))
@@ -98,10 +100,11 @@ def _read(
         scale, repeats = paint.scale, picture is not None and paint.repeats
         result.paints.append(Paint(name, colours, scale, paint.two_sided, picture, repeats))
     # a sky comes last
-    for kind, light in sorted(zip(parsed.lights, lights, strict=True), key=lambda pair: pair[0] == "sky"):
-        if kind != "other":
-            result.lights.append(reader.light(kind, light))
-    result.more_lights.extend(number for number, kind in enumerate(parsed.lights) if kind == "other")
+    for number in sorted(range(len(lights)), key=lambda number: parsed.lights[number] == "sky"):
+        if parsed.lights[number] == "other" or len(result.lights) >= _MOST_LIGHTS:
+            result.more_lights.append(number)
+        else:
+            result.lights.append(reader.light(parsed.lights[number], lights[number]))
     return result if result.lights else None
 
 
@@ -114,11 +117,11 @@ class _Reader:
     """
 
     def __init__(self, mi: MitsubaModule) -> None:
-        self._mi = mi
+        self.mi = mi
 
     def colours(self, shape: MitsubaObject, paint: ParsedPaint) -> tuple[Spectrum, ...]:
         """One or two reflectances of a surface without a picture."""
-        mi, bsdf = self._mi, shape.bsdf()
+        mi, bsdf = self.mi, shape.bsdf()
         # places in a square of each colour
         places = [(0.25, 0.25), (0.75, 0.25)] if paint.texture == "checks" else [(0.0, 0.0)]
 
@@ -135,7 +138,7 @@ class _Reader:
         """The picture on a surface; None for none, or if it is not one of reflectances."""
         if paint.texture != "picture":
             return None
-        parameters = self._mi.traverse(shape.bsdf())
+        parameters = self.mi.traverse(shape.bsdf())
         (key,) = (name for name, _ in parameters if name.endswith("reflectance.data"))
         values = np.array(parameters[key], np.float32)
         is_raw = "raw = 1" in str(shape.bsdf())
@@ -147,22 +150,9 @@ class _Reader:
         """Radiance of a lamp, W m⁻² sr⁻¹ nm⁻¹."""
         return self._spectrum(shape.emitter(), shape.emitter().eval)
 
-    def frame(self, shape: MitsubaObject) -> NDArray[np.float64] | None:
-        """The frame of a rectangle, see `area_light_frame`; None if it has no right angles."""
-        mi = self._mi
-        frame = matrix_of(mi.traverse(shape)["to_world"])
-        width, height = frame[:3, 0].copy(), frame[:3, 1]
-        if abs(width @ height) > _RIGHT_ANGLED * np.linalg.norm(width) * np.linalg.norm(height):
-            return None
-        normal = np.array(shape.sample_position(0.0, mi.Point2f(0.5)).n, np.float64).ravel()
-        # corners run anticlockwise for who sees it shine
-        frame[:3, 0] = width if np.cross(width, height) @ normal > 0 else -width
-        frame[:3, 2] = normal
-        return frame
-
     def light(self, kind: str, light: MitsubaObject) -> DirectLight:
         """A light that no shape is."""
-        mi = self._mi
+        mi = self.mi
         if kind == "sky":
             return DirectLight("sky", self._spectrum(light, light.eval).scaled(pi), pi, np.empty(0))
         parameters = mi.traverse(light)
@@ -177,7 +167,7 @@ class _Reader:
 
     def _from(self, light: MitsubaObject, place: NDArray[np.float64]) -> Spectrum:
         """Irradiance that a point or directional light gives a place across its rays, W m⁻² nm⁻¹."""
-        mi = self._mi
+        mi = self.mi
 
         def evaluate(si: Interaction) -> Bands:
             si.p = mi.Point3f(place)
@@ -187,7 +177,7 @@ class _Reader:
 
     def _spectrum(self, owner: MitsubaObject, evaluate: Callable[[Interaction], Bands]) -> Spectrum:
         """What an object evaluates, by wavelength: at every nm, and at the samples of its tables."""
-        mi = self._mi
+        mi = self.mi
         low, high = RENDERABLE_NM
         knots = [np.arange(low, high + 1), *_tables_of(mi, owner)]
         nm = np.unique(np.concatenate(knots))

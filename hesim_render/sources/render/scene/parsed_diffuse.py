@@ -26,8 +26,8 @@ class ParsedPaint:
     Parameters
     ----------
     name : id of the shape, empty if it has none.
-    light : ``none``; ``lamp`` if the shape is one of closed form as well; ``even`` or ``uneven`` if its light has no
-        closed form, and is the same everywhere or not.
+    light : ``none``; ``lamp`` if the shape may be one of closed form as well; ``even`` or ``uneven`` if its light has
+        none, and is the same everywhere or not.
     two_sided, scale : see `Paint`.
     texture : ``even``, ``checks`` or ``picture``; ``other`` if the surface is not diffuse, or has no closed form.
     interpolation, repeats : of a picture.
@@ -128,9 +128,12 @@ def _parsed_bsdf(nodes: Sequence[Any], bsdf: Any, own: dict[str, Any]) -> Parsed
 
 
 def _is_lamp(node: Any) -> bool:
-    """True if the light of a shape that shines has a closed form: a ball must shine outwards."""
+    """True if the light of a shape that shines may have a closed form: a ball must shine outwards, and a mesh be a
+    rectangle.
+    """
     name = node.props.plugin_name()
-    return name == "rectangle" or (name == "sphere" and not node.props.get("flip_normals", False))
+    is_mesh = name in ("obj", "ply", "serialized")
+    return is_mesh or name == "rectangle" or (name == "sphere" and not node.props.get("flip_normals", False))
 
 
 def _is_even_light(nodes: Sequence[Any], node: Any) -> bool:
