@@ -44,6 +44,7 @@ def test_the_environment_comes_before_the_driver(tmp_path):
     assert claim_device(one, locks=tmp_path) is None and one == {VISIBLE: "1"}
 
 
+@pytest.mark.slow
 def test_workers_take_different_gpus_and_a_dead_one_gives_its_own_back(tmp_path):
     """Three processes have three GPUs; a fourth shares one; after a kill its GPU is free again."""
 

@@ -468,6 +468,7 @@ def test_windows_of_a_lamp_that_flickers_are_no_readout_limit():
         assert (readout_limit([one])[0]["value"] is not None) is is_limited
 
 
+@pytest.mark.slow
 def test_what_is_not_identifiable_says_why(tmp_path):
     _, events, moving = sensor(8)
     names = files(events, moving, tmp_path)
@@ -519,6 +520,7 @@ def test_a_scene_that_moves_at_a_steady_rate_is_a_finding_and_tells_no_leak():
     assert "its rate changes (findings)" in found["recordings"][0]["leak_rate_hz"]["reason"]
 
 
+@pytest.mark.slow
 def test_a_camera_that_has_not_settled_spoils_no_leak():
     """A burst of OFF events at the begin of one of three recordings: the others tell what they told without it."""
     truth, events, moving = sensor(4)

@@ -48,6 +48,7 @@ def truth(camera):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", truth(CAMERA))
 def test_intervals_hold_the_truth_of_a_hundred_devices(sections, name):
     """95 of 100 in the mean; 90 to 99 have a chance of 98 % for one parameter, and the seeds are fixed."""
@@ -124,6 +125,7 @@ def test_saturation_is_between_the_levels_around_it(sections):
         assert low < full_well < high and section["full_well_e"]["limited_by"] == "ADC full scale"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limited_by", [pytest.param("ADC full scale", marks=pytest.mark.slow), "full well"])
 def test_where_the_signal_ends_lies_in_its_interval_wherever_the_levels_are(limited_by):
     """36 of 40 or more; the levels, 670 e⁻ apart, fall anywhere. The standard's value itself is one of the levels."""

@@ -32,6 +32,7 @@ def test_mean_and_variance_of_a_rounded_value(level, noise):
     assert variance == pytest.approx((grey - grey @ chance) ** 2 @ chance, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("level", "spread", "noise"), [(3.5, 0.15, 0.22), (5.13, 0.31, 0.27), (2.94, 0.62, 0.4), (8.21, 0.11, 0.34)]
 )

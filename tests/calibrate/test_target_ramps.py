@@ -40,6 +40,7 @@ def ramp_events(rng, sigma, cutoff_hz, interval_s, pixels, count=9):
     return times[2 : 2 + count]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sigma", "cutoff_hz"), [(0.02, 8.0), (0.05, 25.0), (0.15, 12.0), (0.08, 150.0), (0.2, 70.0),
                                                   (0.1, 400.0), (0.15, 500.0)])  # fmt: skip
 def test_noise_moves_events_of_a_ramp_as_the_law_says(sigma, cutoff_hz):

@@ -116,6 +116,7 @@ def judged(of, tallies):
     return np.array(outcome)  # [recording, figure, hit and error]
 
 
+@pytest.mark.slow
 def test_pixels_that_see_less_of_the_target_and_parts_of_cycles_do_not_count():
     """Of 26 rows three see 0.6 of the contrast, as at the corners of a checkerboard, and three rise and fall longer, as
     in the middle of a star; 9.45 cycles begin at any place, but those of the left half alike.
@@ -589,6 +590,7 @@ def test_noise_at_the_rests_does_not_lower_the_thresholds(name):
     assert outcome[:, :2, 1].mean() > -0.01
 
 
+@pytest.mark.slow
 def test_rests_that_differ_from_pixel_to_pixel_are_not_used():
     """Half of the pixels see each cycle in half of the time; light that turns at once has no rests either."""
     of = SIX["low thresholds"]

@@ -115,6 +115,7 @@ def test_output_that_nobody_reads_is_no_failure_and_a_full_disk_is_one_line(comm
             assert done.returncode == 2
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_nobody_reads_what_it_says(tmp_path):
     run = [
         sys.executable, "-m", "hesim_render.cli", "simulate", "dark", "--sensor", "reference-mono", "--roi", "8x8",

@@ -87,6 +87,7 @@ def test_a_new_sensor_file_may_begin_as_a_copy(capsys, tmp_path):
     assert not (tmp_path / "other.yaml").exists()
 
 
+@pytest.mark.slow
 def test_a_sensor_whose_calibration_covers_a_part_is_described_by_it(capsys, tmp_path):
     """The file alone is enough: there is no region to be given."""
     roi = "{x: 6, y: 4, width_px: 32, height_px: 32}"

@@ -46,6 +46,7 @@ def test_the_probe_of_a_backend_runs_none(working_folder):
     assert not working_folder.exists(), working_folder.read_text()
 
 
+@pytest.mark.slow
 def test_a_worker_of_a_build_runs_none_and_has_the_package_of_its_parent(working_folder):
     """The worker is a real one; that its order is of another version shows that it got as far as that."""
     plan = BenchmarkPlan(generated(1))

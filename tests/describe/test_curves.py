@@ -354,6 +354,7 @@ def test_mistakes_are_named(arguments, text):
         s_curve(hr.load_sensor("gen2"), 1.0, [-1.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHEETS)
 def test_noise_and_latency_have_no_kink_where_the_dark_current_begins(name):
     """Light and dark current together set the corner. The noise of a current I + I₀ in a bandwidth that is proportional

@@ -155,6 +155,7 @@ def test_a_recording_as_mcap(name, tmp_path):
         np.testing.assert_array_equal(events_by_others(path), recording.events)
 
 
+@pytest.mark.slow
 def test_the_npz_of_h_esim_hold_every_event_of_each_tick(tmp_path):
     recording = recordings.make("gen2", tmp_path / "r")
     tick_us = recording.manifest["sensor"]["spec"]["evs"]["tick_us"]

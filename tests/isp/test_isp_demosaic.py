@@ -251,6 +251,7 @@ def test_tiles_of_odd_size_are_developed():
     assert psnr(demosaic(mosaic_of(picture, FIVE).astype(np.float32), FIVE), picture) > 33
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["natural", "checker", "grey", "rgb", "hue"])
 def test_bayer_is_not_below_menon(name):
     """colour-demosaicing's Menon (2007) with its refining step on the same balanced mosaic."""

@@ -42,6 +42,7 @@ def test_a_short_run_is_listed_whole():
     assert sample.share == 1 and (sample.count, sample.windows) == listed(blocks, 16_382_345)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pieces", "rel"),
     [

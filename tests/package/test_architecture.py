@@ -241,6 +241,7 @@ print(json.dumps([sorted(asked), [name for name in ("drjit", "mitsuba") if name 
 """
 
 
+@pytest.mark.slow
 def test_imports_point_down_when_they_run():
     """What the text of a module says, seen while every module is loaded: hooks and helpers cannot hide an arrow.
 

@@ -58,6 +58,7 @@ def test_a_card_shows_texts_as_they_are():
     assert "\\# big \\| \\!\\[x\\](http://x/y) \\`c\\`" in text and "&lt;b&gt;\\|s" in text
 
 
+@pytest.mark.slow
 def test_an_orphaned_worker_ends_in_silence():
     """Its answers are read by nobody; the parent was killed."""
     code = with_package("from hesim_render.benchmark.worker import main; main()")

@@ -45,6 +45,7 @@ def test_descriptions_are_short_and_say_what_is_what():
         assert len(repr(thing)) < 200
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "call",
     [
@@ -93,6 +94,7 @@ def test_quality_and_samples_exclude_each_other_in_one_reading():
         simulate(scene, sensor, quality=0.5, exact=True)
 
 
+@pytest.mark.slow
 def test_shells_complete_commands_and_names():
     def completed(*words):
         environment = {

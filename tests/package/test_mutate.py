@@ -32,6 +32,7 @@ def test_every_kind_of_change_is_made(tmp_path, monkeypatch):
     assert (tmp_path / "m.py").read_text() == code
 
 
+@pytest.mark.slow
 def test_a_change_reaches_the_tests_and_leaves_no_trace(tmp_path, monkeypatch):
     """Through the hook, in a process of its own: the module has the source that it was given."""
     test = tmp_path / "test_one.py"

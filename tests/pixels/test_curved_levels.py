@@ -94,6 +94,7 @@ def test_events_are_those_of_the_curve(follows, dead_us, noisy):
     assert differing <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drift", (False, True))
 @pytest.mark.parametrize("dead_us", (None, 600))
 def test_pixels_far_from_a_threshold_are_not_followed_and_lose_nothing(dead_us, drift, monkeypatch):

@@ -47,6 +47,7 @@ def counts(noise, until_us, seed=5, electrons=0.0, **keys):
     return np.array(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", (
     {}, {"evs__threshold_mismatch_rel": 0.1}, {"evs__refractory_period_us": 150, "evs__threshold_mismatch_rel": 0.1},
     {"evs__refractory_period_us": 1500, "evs__leak_rate_hz": 2.0}, {"evs__refractory_period_us": 90_000},

@@ -97,6 +97,7 @@ def counts_of(stage, noise, electrons, ticks, t0_us=0):
     return on, off
 
 
+@pytest.mark.slow
 def test_counts_are_over_dispersed_with_noise_per_instant():
     """Successive ΔV correlate by −½: an ON is likelier followed by an OFF. 6 comparisons at z = 5.5."""
     ticks, theta = 40, 0.25

@@ -112,6 +112,7 @@ def test_the_variance_falls_with_the_corner_below_the_noises_bandwidth(approach,
     assert noise.without("bandwidth").noise_share(some, position) == 1.0
 
 
+@pytest.mark.slow
 def test_events_of_filtered_noise_do_not_depend_on_sampling_or_on_a_stop():
     changes = {"evs.coefficients.0.beta4": 7.0, "evs.refractory_period_us": 300}
     noise = sensor(16, 16, changes).evs

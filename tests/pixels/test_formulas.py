@@ -211,6 +211,7 @@ def test_events_of_a_defect_show_where_the_comparison_gave_none():
         np.testing.assert_allclose(evs.own_events(own + rest * q, on, off, polarity), q, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_calibration_fits_the_formulas_where_drjit_and_mitsuba_cannot_be_imported(tmp_path):
     """The formulas of both kinds of pixel, and both fits, run there; no sampler is loaded."""
     capture_sets.write_events(tmp_path / "set", size=64, trials=20000)

@@ -157,6 +157,7 @@ def test_noise_and_drift_against_numpy(sigma, rate_hz):
     assert intervals.size > 2000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", ({}, {"evs__refractory_period_us": 2500}), ids=("plain", "dead-time"))
 def test_the_rate_does_not_depend_on_time(changes):
     """Noise events and drift together: the first 0.3 s against the 1.2 s after them, within 10 %: the law with which

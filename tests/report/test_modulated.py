@@ -135,6 +135,7 @@ def test_one_cycle_after_the_first_two_is_enough(tmp_path):
     assert np.isnan(modulated._answered(bench, bench.spec.modulation[0], EVERY)).all()
 
 
+@pytest.mark.slow
 def test_steps_without_a_reset_use_the_thresholds_by_counts(tmp_path):
     """Twice the threshold of the dynamic range is that of the counts, and the report says why."""
     rng = np.random.default_rng(23)

@@ -106,6 +106,7 @@ def check(parts, wanted):
     return ends
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("code", "hangs"), [
     ("import time; time.sleep(60)", True),
     ("while True: pass", True),

@@ -60,6 +60,7 @@ def reset_pixel_rates(on, off, dead_periods, seed, pixels=400, periods=700, firs
     return events / (pixels * (periods - first))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("on", "off", "dead_periods"),
     # not among the entries of the table: means 2.2 and 2.8, differences of 0 and 0.35, dead times between two entries

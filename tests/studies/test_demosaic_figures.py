@@ -112,6 +112,7 @@ def test_a_picture_with_noise_has_the_levels_of_the_chart(monkeypatch):
     assert 0.01 < figures["picture_error_simulated"] < 0.2
 
 
+@pytest.mark.slow
 def test_mosaics_cost_what_their_sampling_says():
     """On grey patterns a Bayer mosaic keeps the resolution of the pixels; sparse colours give more false colour."""
     study = {**STUDY, "filter_sets": ["rggb", "rgbw-half"], "illuminance_lux": [2000], "noise": {"repeats": 2}}

@@ -170,6 +170,7 @@ def reference(cost, curves, bands=BANDS):
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES)
 def test_gradients_of_the_cost_are_central_differences(family):
     """Through filters, Eq. 1 and the best matrix: 1e-3 of the gradient's norm, on a float64 copy of everything."""
@@ -300,6 +301,7 @@ def test_no_exchange_of_two_pixels_spreads_a_tile_more():
         assert energy(other) > least - 1e-3  # what lies farther than one repetition is not counted there
 
 
+@pytest.mark.slow
 def test_a_design_of_shares_ends_in_a_tile_of_its_own(tmp_path):
     """Noise alone: the share of a filter follows from its electrons and its part in the matrix."""
     spec = {**SMALL, "tile_px": [4, 4], "silicon_depth_um": [2.0, 4.0], "steps": 8, "demosaic": False,

@@ -134,6 +134,7 @@ def test_a_grey_card_that_saturates_has_no_noise_figures():
     assert table["white_clipped"].tolist() == [False, True]
 
 
+@pytest.mark.slow
 def test_noise_aware_figures_are_those_of_the_matrix_with_the_least_squared_error_and_come_first(tmp_path, capsys):
     """RGBW before RGGB in dim light, the other way round with the matrix of colour; and white clips at 1000 lx."""
     spec = tmp_path / "study.yaml"

@@ -154,6 +154,7 @@ def test_where_rounding_hides_the_dark_noise_grey_values_tell_it(tmp_path, monke
     assert any("by the probabilities of grey values it is 0.2" in finding.text for finding in twin.findings)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 @pytest.mark.parametrize("factor", (0.93, 1.0, 1.07))
 def test_where_a_full_well_ends_is_compared(tmp_path, monkeypatch, factor):

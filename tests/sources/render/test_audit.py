@@ -129,6 +129,7 @@ def coverage(kind, seeds, monkeypatch):
     return wanted, covered, {name: float(np.mean(values)) for name, values in bounds.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [KINDS[0], *(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS[1:])])
 def test_bounds_cover_where_misses_come_in_clusters(kind, monkeypatch):
     """A bound of 99 % that fails in more than one of 12 seeds: chance of 0.6 %."""

@@ -160,6 +160,7 @@ def test_direct_light_keeps_its_windows(monkeypatch, scene):
     assert len(list(source.flux_of_blocks(source.sensor.layout.evs_pixel.ravel(), blocks))) > 1
 
 
+@pytest.mark.slow
 def test_the_estimate_of_a_block_knows_of_bends_and_that_of_a_window_does_not(monkeypatch):
     source = ChangeDrivenFlux(hr.load_scene(KNOT), hr.load_sensor("davis346").crop(5, 4, 162, 118))
     pixel = source.sensor.layout.evs_pixel.ravel()

@@ -104,6 +104,7 @@ def test_a_pilot_knows_the_scatter_of_what_paths_find(depth):
     np.testing.assert_array_equal(joined.bounced_scatter[~some], seen.bounced_scatter[~some])
 
 
+@pytest.mark.slow
 def test_a_ball_of_plastic_does_not_make_a_scene_dear(monkeypatch):
     """One that nobody sees: rays of 3 ms, those by paths alone, and true errors against 4 × 4096 rays of these."""
     sensor, pixels = hr.load_sensor("davis346").crop(40, 30, 150, 110), np.arange(40 * 30, dtype=np.uint32)

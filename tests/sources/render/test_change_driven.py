@@ -297,6 +297,7 @@ def test_a_long_run_is_refused_unless_wanted():
         hr.simulate(scene, sensor, quality=0.5, samples=16)
 
 
+@pytest.mark.slow
 def test_the_estimate_of_the_longest_run_comes_at_once():
     """4000 s of an asynchronous sensor are millions of windows, and none of them is listed before the estimate.
 

@@ -121,6 +121,7 @@ def test_closed_form_sees_what_mitsubas_paths_see(tmp_path):
     assert_same(tracer, scene, sensor)
 
 
+@pytest.mark.slow
 def test_a_lamp_that_is_off_stays_as_a_painted_surface(tmp_path):
     sensor, scene = hr.load_sensor("gen2").crop(60, 44, 1400, 1000), loaded(tmp_path, unlit=["lamp"])
     tracer = pair_tracer(scene, sensor)
@@ -194,7 +195,7 @@ def test_objects_that_shine_are_seen_in_closed_form():
     assert [each.kind for each in diffuse.lights] == ["ball", "ball", "sky"]
 
 
-@pytest.mark.parametrize("depth", [2, 4])
+@pytest.mark.parametrize("depth", [pytest.param(2, marks=pytest.mark.slow), 4])
 def test_boxes_that_shine_and_maps_of_scene_files_are_seen_by_paths_beside_lamps(tmp_path, depth):
     """A box, a ball of plastic and a printed lamp of a target that shine, under a lamp and a map of the sky."""
     Image.fromarray(np.random.default_rng(5).integers(20, 250, (5, 8, 3), dtype=np.uint8)).save(tmp_path / "sky.png")
@@ -438,7 +439,7 @@ OTHERS = """
 </scene>"""
 
 
-@pytest.mark.parametrize("depth", [2, 5])
+@pytest.mark.parametrize("depth", [pytest.param(2, marks=pytest.mark.slow), 5])
 def test_gloss_and_what_bounces_are_seen_by_paths_beside_closed_forms(tmp_path, depth):
     """Against Mitsuba's own path tracer. Light is sampled at what is glossy, and known at what is not."""
     text = SCENE.replace("</scene>", OTHERS).replace('"max_depth" value="2"', f'"max_depth" value="{depth}"')
@@ -469,8 +470,10 @@ MORE = """
 </scene>"""
 
 
-@pytest.mark.parametrize("depth", [2, 5])
-@pytest.mark.parametrize("lamps", [True, False])
+@pytest.mark.parametrize(
+    "depth, lamps",
+    [(5, False), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((2, False), (2, True), (5, True)))],
+)
 def test_lights_without_a_closed_form_are_seen_by_paths_beside_others(tmp_path, depth, lamps):
     """Against Mitsuba's own path tracer, with many lights of closed form and with the point light alone."""
     (tmp_path / "hair.txt").write_text("-0.2 0.2 0.02 0.008\n0.0 0.23 0.06 0.008\n0.2 0.2 0.03 0.008\n")
@@ -505,6 +508,7 @@ def test_a_direct_integrator_has_depth_2(tmp_path):
     assert pair_tracer(hr.load_scene(tmp_path / "scene.yaml", {"max_depth": 2}), mono(8, 6)).is_diffuse
 
 
+@pytest.mark.slow
 def test_moving_shapes_have_the_wanted_error_in_the_default_mode(tmp_path, monkeypatch):
     """A board with a picture slides and turns, and its shadows with it; errors in noise units against paths."""
     turn = "{t_us: 100000, translation_m: [0.2, 0.05, 0], rotation_axis: [0, 0, 1], rotation_deg: 40}"

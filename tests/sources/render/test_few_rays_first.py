@@ -112,6 +112,7 @@ def test_exposures_of_diffuse_scenes_ask_few_rays_first(scene, sensor, few):
         assert not any(each.few_first for each in events)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pop-in plates", pytest.param("fan", marks=pytest.mark.slow)])
 def test_what_is_there_for_a_part_of_an_exposure_is_not_missed(name):
     """Against 8192 rays of other random numbers: in plates that are there for 0.7 of 10 ms, and between blades."""

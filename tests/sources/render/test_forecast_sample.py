@@ -39,6 +39,7 @@ def test_pixels_that_lie_apart_are_taken_one_by_one(monkeypatch):
     assert forecast._sample(pixel, source, "any", rng).tolist() == [8 * k for k in (0, 300, 450, 775, 825)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sensor", "is_short"), [pytest.param("davis346", True, marks=pytest.mark.slow), ("reference-mono", False)]
 )

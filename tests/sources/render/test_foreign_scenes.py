@@ -157,6 +157,7 @@ CLOSED = {
 }
 
 
+@pytest.mark.slow
 def test_a_pixel_in_which_no_ray_saw_light_states_the_error_that_is_wanted():
     """A floor that reflects nothing shows nothing, yet its rays do not prove that no light comes from there."""
     black = {"type": "diffuse", "reflectance": even(0.0)}
@@ -201,6 +202,7 @@ def furnace(integrator, depth=None):
     return mitsuba_scene({**CLOSED, **({"integrator": integrator} if integrator else {})}, depth=depth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plugin", ["path", "volpath", pytest.param("volpathmis", marks=pytest.mark.slow)])
 def test_max_depth_of_the_scene_file_changes_the_scenes_own_integrator(plugin):
     # at rr_depth 1 with all walls at 0.8 roulette ends a fifth of all paths: they are noisier, none is lost
@@ -236,6 +238,7 @@ def test_direct_light_alone_is_not_made_longer():
     np.testing.assert_allclose(asked.mean(), path.mean(), rtol=0.02)  # 192 pixels, 4 % each: 7 σ
 
 
+@pytest.mark.slow
 def test_direct_light_alone_is_a_path_of_two_segments_in_the_default_mode():
     """Against Mitsuba's own picture by its own `direct` with 3 and 2 samples, light that comes back left out."""
     sensor, own = mono(COLS, ROWS), {"type": "direct", "emitter_samples": 3, "bsdf_samples": 2}
@@ -533,6 +536,7 @@ def test_a_bitmap_that_was_handed_over_is_still_there_the_second_time():
     np.testing.assert_array_equal(exact_flux(scene, mono(COLS, ROWS), 16), first)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "many", [pytest.param(False, marks=pytest.mark.slow), True], ids=["faces in closed form", "searched by Mitsuba"]
 )

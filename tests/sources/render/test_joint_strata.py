@@ -39,6 +39,7 @@ camera: {origin_m: [0.3, -0.4, 1.9], target_m: [0.05, 0.02, 0], horizontal_fov_d
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("depth", "shared"), [(1, False), (3, False), pytest.param(3, True, marks=pytest.mark.slow)])
 def test_penumbrae_have_smaller_errors_than_with_directions_drawn_apart(tmp_path, monkeypatch, depth, shared):
     """RMS error of pixels, by five repetitions of 1024 rays: lamps in closed form, paths, and paths in tiles; and the

@@ -53,6 +53,7 @@ def usual():
     return scene, traced(scene)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bunch", [*(pytest.param(n, marks=pytest.mark.slow) for n in (1, 3)), 1000])
 def test_bunches_change_no_bit(bunch, usual, monkeypatch):
     scene, first = usual

@@ -141,6 +141,7 @@ def test_meshes_without_a_surface_are_one_line(tmp_path):
         hr.load_scene(scene_file(tmp_path, "line.stl", ", materials: file"))
 
 
+@pytest.mark.slow
 def test_a_moving_mesh_of_several_parts_is_rendered_in_the_default_mode(tmp_path):
     (tmp_path / "two.glb").write_bytes(two_parts().export(file_type="glb"))
     text = scene_file(tmp_path, "two.glb", ", materials: file, size_m: [0.2, 0.1, 0.01]").read_text()

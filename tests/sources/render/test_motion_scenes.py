@@ -25,6 +25,7 @@ def test_the_script_writes_the_shipped_files(name):
     assert (data_folder("scenes") / f"{name}.yaml").read_text() == script.content_of(name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", script.SCENES)
 def test_a_motion_scene_has_texture(name):
     textured = [item for item in hr.load_scene(name).spec.objects if item.pattern is not None]

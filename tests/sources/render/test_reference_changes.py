@@ -41,6 +41,7 @@ def ball():
     return source, changes, source.rays_traced - done
 
 
+@pytest.mark.slow
 def test_changes_are_as_good_as_those_of_levels_from_a_part_of_the_rays(ball, monkeypatch):
     """Against 6 × 4096 rays of the run's own stream. Asked for is a quarter of a noise unit."""
     source, changes, rays = ball
@@ -126,6 +127,7 @@ def test_a_better_quality_takes_more_rays(ball):
     assert source.rays_traced > 1.5 * rays
 
 
+@pytest.mark.slow
 def test_direct_light_ticks_and_aimed_rays_keep_references_of_the_level():
     """Closed forms and lines know the star's levels for few rays, rays at specks these; much moves in a tick."""
     pixel, begin, end = asked(30)

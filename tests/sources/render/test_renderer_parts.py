@@ -267,6 +267,7 @@ def test_anything_else_is_left_to_mitsuba(shapes):
         )
 
 
+@pytest.mark.slow
 def test_an_even_sky_is_left_to_the_surfaces_own_directions():
     """A lamp and a sky: no light is sampled towards the sky, all of it arrives; a sky alone is sampled.
 

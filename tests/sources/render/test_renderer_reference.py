@@ -81,6 +81,7 @@ def test_edge_that_moves_across_pixels(move):
     assert 0.4 < np.mean(z**2) < 1.15 + 4.4 * np.sqrt(3.6 / len(windows))
 
 
+@pytest.mark.slow
 def test_lamp_that_flickers_while_it_moves():
     """The light's power and the coverage change together; the mean of their product in NumPy."""
     waveforms = {
@@ -165,6 +166,7 @@ def test_what_is_asked_for_besides_does_not_matter():
     assert other.flux[0, 0] != alone.flux[0, 0]
 
 
+@pytest.mark.slow
 def test_still_scene_is_one_estimate_for_all_windows():
     light = {"type": "uniform", "illuminance_lux": 500, "waveform": {"type": "mains", "frequency_hz": 50, "depth": 0.5}}
     scene = hr.load_scene("colorchecker", {"light": light})

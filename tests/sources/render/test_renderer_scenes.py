@@ -51,12 +51,15 @@ ALIKE = (
 )
 #: Motions of textured solids, as in `glass-and-metal` and `traffic-light`.
 MOVING_ALIKE = ("facade-drive", "falling-objects", "fan", "hand-held", "pendulum", "robot-arm")
+#: Kernels of their own, which take long to compile.
+DEAR = ("dead-leaves", "glass-and-metal", "traffic-light")
 #: Darkness, and streets at night and by day.
 OTHER_LIGHT = ("dark", "traffic-light", "facade-drive")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in ALIKE + MOVING_ALIKE else n for n in list_names("scenes")]
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow) if n in ALIKE + MOVING_ALIKE + DEAR else n for n in list_names("scenes")],
 )
 def test_every_shipped_scene_renders(name):
     scene = hr.load_scene(name)

@@ -60,6 +60,7 @@ def assert_agreement(ours, reference):
     assert abs(ours.mean() / theirs.mean() - 1) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "light", [pytest.param(DIRECTIONAL, marks=pytest.mark.slow), AREA], ids=["directional", "area"]
 )

@@ -168,6 +168,7 @@ def test_shared_light_has_no_bias(scene_of, with_things):
     assert total[0].std() / 24**0.5 < 2e-3 * total[0].mean()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("turn_deg", "x", "lies"), [(-90, -0.05, False), (90, -0.5, False), (-90, -0.05, True)])
 def test_no_light_is_shared_through_a_wall(scene_of, turn_deg, x, lies):
     """A floor from above, and a sheet that stands on it, edge-on, in the middle of a tile. A lamp on one side shines at

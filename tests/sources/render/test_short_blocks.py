@@ -42,6 +42,7 @@ def run(scene, begin_us, end_us):
     return values, ends_us, (source.counts.rays, source.counts.pilot_rays)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("light", "thing", "part"),
     [
@@ -67,6 +68,7 @@ def test_values_are_the_same_and_pilots_take_fewer_rays(monkeypatch, light, thin
     assert rays_now[0] == rays_before[0] and rays_now[1] <= part * rays_before[1]
 
 
+@pytest.mark.slow
 def test_pilots_are_compared_with_the_same_rays_of_the_first_window(monkeypatch):
     """Where only some sites are traced in the first window, others keep what the anchor shows."""
     scene, pilot, seen = scene_of(SUN, {}), AdaptiveRenderer.pilot, []

@@ -172,6 +172,7 @@ def test_the_scatter_of_pictures_is_not_mild(tmp_path):
         assert renderer.tracer.is_diffuse and bands[0].mild == mild
 
 
+@pytest.mark.slow
 def test_moving_pictures_have_the_wanted_error_in_the_default_mode(tmp_path, monkeypatch):
     """A photo slides, a box with another one turns. Errors in noise units against the path tracer, which sees Mitsuba's
     own textures, and their mean (false alarm 1e-5).
