@@ -20,7 +20,8 @@ def lamp_frame(mi: MitsubaModule, shape: MitsubaObject) -> NDArray[np.float64] |
     mi : the mitsuba module.
     shape : of the loaded scene.
     """
-    frame = _frame_of_mesh(shape) if shape.is_mesh() else matrix_of(mi.traverse(shape)["to_world"])
+    parameters = mi.traverse(shape)
+    frame = matrix_of(parameters["to_world"]) if "to_world" in parameters else _frame_of_mesh(shape)
     if frame is None:
         return None
     width, height = frame[:3, 0].copy(), frame[:3, 1]
