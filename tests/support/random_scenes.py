@@ -3,7 +3,7 @@
 The camera is 2 m before the plane z = 0, of which it sees 0.8 m. 1 to 20 shapes move, or some of them; they are as
 small as a twentieth of a pixel and as large as a third of the picture, and go from a pixel in a second to 25 pixels
 in the 12.5 ms of a run. Half of the scenes have diffuse solids under this project's own lights, half are Mitsuba's,
-with glass and metal.
+with glass and metal. From seed 3000 on, lights without a closed form shine beside the others.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ DURATION_US = 12_500
 SENSORS = {"hybrid": ("eiger", "gen2", "mipi-hybridevs", "reference-mono"), "asynchronous": ("davis346",)}
 _TETRAHEDRON = "v 1 1 1\nv 1 -1 -1\nv -1 1 -1\nv -1 -1 1\nf 1 2 3\nf 1 4 2\nf 1 3 4\nf 2 4 3\n"
 _ILLUMINANTS = ("D65", "A", "FL11", "LED-B3")
+#: First seed of scenes with lights of every kind.
+MORE_LIGHTS = 3000
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,9 @@ def random_scene(seed: int, folder: Path, cols: int = COLS, rows: int = ROWS) ->
     count = int(np.ceil(20 ** rng.random()))
     content: dict[str, Any] = {"schema_version": 1, "name": f"random {seed}", "description": ""}
     content |= (_foreign if is_mitsuba else _native)(rng, count)
+    if seed >= MORE_LIGHTS:
+        # numbers of their own, so that older seeds stay as they are
+        (_add_to_foreign if is_mitsuba else _add_to_native)(np.random.default_rng([seed, 1]), content, folder)
     content["camera"] = {"origin_m": [0, 0, 2], "target_m": [0, 0, 0], "horizontal_fov_deg": 22.62}
     content["motion"] = [_track(rng, f"shape{k}") for k in range(count) if k == 0 or rng.random() < 0.8]
     if rng.random() < 0.2:
@@ -195,6 +200,23 @@ def _native(rng: np.random.Generator, count: int) -> dict[str, Any]:
     return {"objects": objects, "light": lights}
 
 
+def _add_to_native(rng: np.random.Generator, content: dict[str, Any], folder: Path) -> None:
+    """A box that shines, or a map in place of uniform light, or both."""
+    from PIL import Image
+
+    is_map, is_box = (rng.random(2) < 0.6) | (rng.random() < 0.3)
+    if is_map:
+        Image.fromarray(rng.integers(5, 250, (6, 12, 3), dtype=np.uint8)).save(folder / "map.png")
+        lux = _log_uniform(rng, 150, 3000)
+        kept = [light for light in content["light"] if light["type"] != "uniform"]
+        content["light"] = [*kept, {"type": "environment", "file": "map.png", "illuminance_lux": lux}]
+    if is_box:
+        sizes = [_size_m(rng) for _ in range(3)]
+        glow = {"luminance_cd_m2": _log_uniform(rng, 20, 2000), "illuminant": str(rng.choice(_ILLUMINANTS))}
+        box = {"name": "glow", "shape": "box", "size_m": sizes, "position_m": _place(rng), "reflectance": 0.3}
+        content["objects"].append({**box, "emission": glow})
+
+
 # ---- scenes of Mitsuba's own --------------------------------------------------------------------------
 
 
@@ -273,6 +295,29 @@ def _foreign(rng: np.random.Generator, count: int) -> dict[str, Any]:
     if rng.random() < 0.5:
         shapes["sky"] = {"type": "constant", "radiance": {"type": "uniform", "value": _log_uniform(rng, 2e-4, 5e-3)}}
     return {"mitsuba": {"inline": shapes, "waveforms": waveforms}}
+
+
+def _add_to_foreign(rng: np.random.Generator, content: dict[str, Any], folder: Path) -> None:
+    """A spot, a block that shines, a checked disk that shines, or several of them."""
+    shapes = content["mitsuba"]["inline"]
+    which = rng.random(3) < 0.45
+    if which[0] or not which.any():
+        place = rng.uniform([-1.2, -0.4, 1.0], [1.2, 1.8, 1.8])
+        towards = -place / np.linalg.norm(place)
+        across = np.cross([0.0, 1.0, 0.0], towards)
+        across /= np.linalg.norm(across)
+        matrix = np.eye(4)
+        matrix[:3] = np.stack([across, np.cross(towards, across), towards, place], axis=1)
+        level = _log_uniform(rng, 1e-3, 0.03) * float(place @ place)
+        light = {"to_world": matrix.tolist(), "intensity": {"type": "uniform", "value": level}}
+        shapes["spot"] = {"type": "spot", **light, "cutoff_angle": float(rng.uniform(4, 30))}
+    for kind, is_there in (("cube", which[1]), ("disk", which[2])):
+        if is_there:
+            own = _to_world(rng, np.array([_size_m(rng) for _ in range(3)]), _place(rng))
+            radiance = {"type": "uniform", "value": _log_uniform(rng, 3e-4, 0.03)}
+            if kind == "disk":
+                radiance = {"type": "checkerboard", "color0": radiance, "color1": {"type": "uniform", "value": 1e-4}}
+            shapes[f"glow-{kind}"] = {"type": kind, "to_world": own, "emitter": {"type": "area", "radiance": radiance}}
 
 
 def _lamp(rng: np.random.Generator) -> dict[str, Any]:

@@ -43,7 +43,7 @@ class KnownLights:
         """A number in [0, 1) that Mitsuba draws a light by, from a uniform one."""
         rest, result = number / self.density, number
         for begin, length in self.runs:
-            result = dr.select(self.lanes & (rest >= 0), begin + dr.minimum(rest, length), result)
+            result = dr.select(self.lanes & (rest >= 0), begin + rest, result)
             rest -= length
         return result
 
