@@ -201,20 +201,11 @@ def _native(rng: np.random.Generator, count: int) -> dict[str, Any]:
 
 
 def _add_to_native(rng: np.random.Generator, content: dict[str, Any], folder: Path) -> None:
-    """A box that shines, or a map in place of uniform light, or both."""
-    from PIL import Image
-
-    is_map, is_box = (rng.random(2) < 0.6) | (rng.random() < 0.3)
-    if is_map:
-        Image.fromarray(rng.integers(5, 250, (6, 12, 3), dtype=np.uint8)).save(folder / "map.png")
-        lux = _log_uniform(rng, 150, 3000)
-        kept = [light for light in content["light"] if light["type"] != "uniform"]
-        content["light"] = [*kept, {"type": "environment", "file": "map.png", "illuminance_lux": lux}]
-    if is_box:
-        sizes = [_size_m(rng) for _ in range(3)]
-        glow = {"luminance_cd_m2": _log_uniform(rng, 20, 2000), "illuminant": str(rng.choice(_ILLUMINANTS))}
-        box = {"name": "glow", "shape": "box", "size_m": sizes, "position_m": _place(rng), "reflectance": 0.3}
-        content["objects"].append({**box, "emission": glow})
+    """A box that shines."""
+    sizes = [_size_m(rng) for _ in range(3)]
+    glow = {"luminance_cd_m2": _log_uniform(rng, 20, 2000), "illuminant": str(rng.choice(_ILLUMINANTS))}
+    box = {"name": "glow", "shape": "box", "size_m": sizes, "position_m": _place(rng), "reflectance": 0.3}
+    content["objects"].append({**box, "emission": glow})
 
 
 # ---- scenes of Mitsuba's own --------------------------------------------------------------------------
@@ -298,9 +289,15 @@ def _foreign(rng: np.random.Generator, count: int) -> dict[str, Any]:
 
 
 def _add_to_foreign(rng: np.random.Generator, content: dict[str, Any], folder: Path) -> None:
-    """A spot, a block that shines, a checked disk that shines, or several of them."""
+    """A spot, a block that shines, a checked disk that shines, a map of the sky, or several of them."""
+    from PIL import Image
+
     shapes = content["mitsuba"]["inline"]
-    which = rng.random(3) < 0.45
+    which = rng.random(4) < 0.45
+    if which[3]:
+        Image.fromarray(rng.integers(5, 250, (6, 12, 3), dtype=np.uint8)).save(folder / "map.png")
+        level = _log_uniform(rng, 1e-3, 0.02)
+        shapes["sky"] = {"type": "envmap", "filename": str(folder / "map.png"), "scale": level}
     if which[0] or not which.any():
         place = rng.uniform([-1.2, -0.4, 1.0], [1.2, 1.8, 1.8])
         towards = -place / np.linalg.norm(place)

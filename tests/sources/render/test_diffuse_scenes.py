@@ -279,16 +279,9 @@ def changed(text, old, new):
     return text.replace(*second) if second else text
 
 
-@pytest.mark.parametrize(
-    "old, new",
-    [
-        ('<shape type="cube" id="block">', '<shape type="merge"><shape type="cube"/></shape><shape type="cube">'),
-        ('name="max_depth" value="2"', 'name="max_depth" value="1"'),
-    ],
-)  # fmt: skip
-def test_what_is_not_known_of_surfaces_is_seen_by_paths(tmp_path, old, new):
-    """One thing is changed in each case."""
-    scene = loaded(tmp_path, changed(SCENE, old, new))
+def test_what_is_seen_of_lamps_alone_is_seen_by_paths(tmp_path):
+    """No light goes from its source to a surface."""
+    scene = loaded(tmp_path, changed(SCENE, 'name="max_depth" value="2"', 'name="max_depth" value="1"'))
     assert build(mitsuba(), scene.spec).diffuse is None
     tracer = pair_tracer(scene, mono(8, 6))
     assert not (tracer.is_diffuse or tracer.has_bounced)
@@ -347,6 +340,10 @@ QUAD = "v -0.1 0.04 0.2\nv -0.06 0.01 0.26\nv 0.02 0.07 0.2366667\nv -0.02 0.1 0
         # a parallelogram
         (QUAD.replace("0.2366667", "0.25").replace("0.1766667", "0.19") + "f 1 2 3 4\n", False),
         (QUAD.replace("0.1766667", "0.18") + "f 1 2 3 4\n", False),
+        # two triangles apart, one without an area, a bent normal at one corner, and at all
+        (QUAD + "v 0 0.1 0.2\nv 0.1 0.1 0.2\nv 0.1 0 0.2\nf 1 2 3\nf 5 6 7\n", False),
+        (QUAD + "f 1 2 3\nf 1 3 1\n", False),
+        (QUAD + "vn -0.0029 0.0057333 0.0048\nvn 0 0 1\nf 1//1 2//1 3//1\nf 1//1 3//1 4//2\n", False),
         (QUAD + "vn 0.1 0 1\nvn 0 0.1 1\nvn 0 0 1\nf 1//1 2//2 3//3 4//3\n", False),
     ],
 )  # fmt: skip
@@ -407,6 +404,7 @@ def test_a_scene_whose_lights_all_lack_a_closed_form_is_seen_by_paths(tmp_path):
     [
         ('name="max_depth" value="2"', 'name="max_depth" value="3"', 0),
         ('<ref id="clay"/></shape>', '<ref id="spare"/></shape>', 1),
+        ('<shape type="cube" id="block">', '<shape type="merge"><shape type="cube"/></shape><shape type="cube">', 1),
         ('<scale x="1.5" y="2"/>', '<scale x="1.5" y="2"/><rotate z="1" angle="10"/>', 1),
         ('<scale x="1.3"/>', '<scale x="1.3"/><translate x="0.2"/>', 1),
         ('value="clamp"', 'value="mirror"', 1),

@@ -27,10 +27,10 @@ def lamp_frame(mi: MitsubaModule, shape: MitsubaObject) -> NDArray[np.float64] |
     width, height = frame[:3, 0].copy(), frame[:3, 1]
     if abs(width @ height) > _RIGHT_ANGLED * np.linalg.norm(width) * np.linalg.norm(height):
         return None
-    normals = [np.array(shape.sample_position(0.0, mi.Point2f(*at)).n, np.float64).ravel() for at in _PLACES]
+    normals = np.array([np.array(shape.sample_position(0.0, mi.Point2f(*at)).n).ravel() for at in _PLACES], np.float64)
     across = np.cross(width, height) / (np.linalg.norm(width) * np.linalg.norm(height))
     # a mesh may have normals of its vertices, by which it would shine
-    if np.ptp([normal @ across for normal in normals]) > _RIGHT_ANGLED or abs(normals[0] @ across) < 1 - _RIGHT_ANGLED:
+    if np.abs(normals @ across).min() < 1 - _RIGHT_ANGLED:
         return None
     # corners run anticlockwise for who sees it shine
     frame[:3, 0] = width if across @ normals[0] > 0 else -width
@@ -42,12 +42,14 @@ def _frame_of_mesh(mesh: MitsubaObject) -> NDArray[np.float64] | None:
     """Half the sides and the middle of two triangles that make a parallelogram; None of others."""
     corners, number = np.unique(mesh_vertices(mesh), axis=0, return_inverse=True)
     faces = number.ravel()[mesh_faces(mesh)]
-    if faces.shape != (2, 3) or len(corners) != 4:
+    if len(faces) != 2:
         return None
     # the side that both share is a diagonal; the other corners lie across it
     shared = np.intersect1d(*faces)
-    (one,), (other,) = (np.setdiff1d(face, shared) for face in faces)
-    first, last, ends = corners[one], corners[other], corners[shared]
+    across = [np.setdiff1d(face, shared) for face in faces]
+    if shared.size != 2 or any(each.size != 1 for each in across):
+        return None
+    (first, last), ends = corners[np.concatenate(across)], corners[shared]
     if np.linalg.norm(first + last - ends.sum(axis=0)) > _RIGHT_ANGLED * np.linalg.norm(last - first):
         return None
     frame = np.eye(4)

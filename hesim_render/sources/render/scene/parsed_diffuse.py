@@ -10,8 +10,8 @@ from hesim_render.sources.render.scene.parsed_scene import children_of
 
 #: Shapes whose surface is what their BSDF says, and nothing else.
 _PLAIN_SHAPES = (
-    *("bsplinecurve", "cube", "cylinder", "disk", "ellipsoids", "linearcurve", "obj", "ply", "rectangle"),
-    *("sdfgrid", "serialized", "sphere"),
+    *("bsplinecurve", "cube", "cylinder", "disk", "linearcurve", "obj", "ply", "rectangle", "sdfgrid"),
+    *("serialized", "sphere"),
 )
 #: Textures that are the same everywhere, and types of properties that are such a colour.
 _EVEN_TEXTURES = ("blackbody", "d65", "irregular", "regular", "srgb", "uniform")
@@ -86,16 +86,17 @@ def _parsed_paint(nodes: Sequence[Any], node: Any) -> ParsedPaint | None:
     """Surface and light of a shape; None if the parser says too little."""
     children = [nodes[number] for number in children_of(node)]
     lamps, bsdfs = ([child for child in children if child.type.name == kind] for kind in ("Emitter", "BSDF"))
-    if node.props.plugin_name() not in _PLAIN_SHAPES or max(len(lamps), len(bsdfs)) > 1:
+    if max(len(lamps), len(bsdfs)) > 1:
         return None
     light = "none"
     if lamps:
         is_even = _is_even_light(nodes, lamps[0])
         light = "uneven" if not is_even else "lamp" if _is_lamp(node) and _is_sampled(lamps[0]) else "even"
     own: dict[str, Any] = {"name": node.props.id(), "light": light, "two_sided": False}
-    if not bsdfs:
-        return ParsedPaint(**own)  # what Mitsuba gives a shape without BSDF is diffuse
-    paint = _parsed_bsdf(nodes, bsdfs[0], own)
+    paint = None
+    if node.props.plugin_name() in _PLAIN_SHAPES:
+        # what Mitsuba gives a shape without BSDF is diffuse
+        paint = _parsed_bsdf(nodes, bsdfs[0], own) if bsdfs else ParsedPaint(**own)
     # what is not diffuse gives no light of closed form
     return paint or ParsedPaint(node.props.id(), light.replace("lamp", "even"), False, texture="other")
 
