@@ -218,6 +218,24 @@ def test_boxes_that_shine_and_maps_of_scene_files_are_seen_by_paths_beside_lamps
     assert_same(tracer, scene, sensor, rays=1024, most=20)
 
 
+def test_lamps_of_a_grid_are_seen_in_the_light_of_another(tmp_path):
+    """Lamps of 5 % that shine, and a board."""
+    grid = {"type": "led-grid", "rows": 2, "cols": 3, "pitch_m": 0.2, "diameter_m": 0.09, "luminance_cd_m2": 60}
+    lamp = {
+        "type": "area",
+        "illuminant": "A",
+        "illuminance_lux": 3000,
+        "position_m": [0.5, 0.4, 1.3],
+        "size_m": [0.5, 0.3],
+    }
+    camera = {"origin_m": [0.0, 0.05, 2], "target_m": [0.0, 0, 0], "horizontal_fov_deg": 22.62}
+    scene, sensor = make_scene(target=grid, light=lamp, camera=camera, max_depth=2), mono(60, 44)
+    diffuse, tracer = build(mitsuba(), scene.spec).diffuse, pair_tracer(scene, sensor)
+    assert diffuse.glows and set(diffuse.glows) < {paint.shape for paint in diffuse.paints}
+    assert tracer.has_bounced
+    assert_same(tracer, scene, sensor, rays=256)
+
+
 def test_what_balls_give_is_what_rays_bring():
     """Irradiance, and its mean over drawn points, of balls of 30 and of 0.3 degrees at several heights."""
     mi, rng = mitsuba(), np.random.default_rng(4)
@@ -415,8 +433,8 @@ def test_a_scene_whose_lights_all_lack_a_closed_form_is_seen_by_paths(tmp_path):
 def test_what_else_has_no_closed_form_is_seen_by_paths_beside_it(tmp_path, old, new, others):
     """One thing is changed in each case."""
     scene = loaded(tmp_path, changed(SCENE, old, new))
-    diffuse = build(mitsuba(), scene.spec).diffuse
-    assert len(diffuse.others) == others and len(diffuse.paints) + others == SCENE.count("<shape")
+    built = build(mitsuba(), scene.spec)
+    assert len(built.diffuse.others) == others and len(built.diffuse.paints) + others == len(built.scene.shapes())
     tracer = pair_tracer(scene, mono(8, 6))
     assert tracer.has_bounced and not tracer.is_diffuse
 
