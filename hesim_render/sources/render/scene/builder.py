@@ -31,6 +31,7 @@ from hesim_render.sources.render.scene.mitsuba_version import (
 from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.sources.render.scene.pictures import picture_texture
 from hesim_render.sources.render.scene.scene_spectra import check_coverage, target_pieces
+from hesim_render.sources.render.scene.solid_meshes import box_mesh, rectangle_mesh
 from hesim_render.sources.render.scene.surfaces import (
     Paint,
     are_few,
@@ -305,31 +306,9 @@ def _object(mi: MitsubaModule, item: ObjectSpec, name: str, placement: NDArray[n
         to_world = transform(mi, placement @ np.diag([half[0]] * 3 + [1.0]))
         sphere = {"type": "sphere", "to_world": to_world, "bsdf": bsdf}
         return sphere if emitter is None else {**sphere, "emitter": emitter}
-    corners, faces, uv = _box_mesh() if item.shape == "box" else _rectangle_mesh()
+    corners, faces, uv = box_mesh() if item.shape == "box" else rectangle_mesh()
     vertices = (corners * half) @ placement[:3, :3].T + placement[:3, 3]
     return make_mesh(mi, name, vertices, faces, bsdf, uv, emitter)
-
-
-def _rectangle_mesh() -> tuple[NDArray, NDArray, NDArray]:
-    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=np.float64)
-    return corners, np.array([[0, 1, 2], [0, 2, 3]]), (corners[:, :2] + 1) / 2
-
-
-def _box_mesh() -> tuple[NDArray, NDArray, NDArray]:
-    """Six faces with outward normals, each with its own u, v from 0 to 1."""
-    vertices: list[NDArray] = []
-    faces: list[NDArray] = []
-    uv: list[NDArray] = []
-    flat, triangles, flat_uv = _rectangle_mesh()
-    for axis in range(3):
-        for sign in (1.0, -1.0):
-            # cyclic axes keep the face right-handed; mirroring u on the far side flips its normal
-            face = np.empty((4, 3))
-            face[:, (axis + 1) % 3], face[:, (axis + 2) % 3], face[:, axis] = flat[:, 0] * sign, flat[:, 1], sign
-            faces.append(triangles + 4 * len(vertices))
-            vertices.append(face)
-            uv.append(flat_uv)
-    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv)
 
 
 class NeedsExactMode(SpecError):
