@@ -486,15 +486,18 @@ MORE = """
 </scene>"""
 
 
+SKY = '<emitter type="constant"><spectrum name="radiance" value="0.13"/></emitter>'
+HAIR = "-0.2 0.2 0.02 0.008\n0.0 0.23 0.06 0.008\n0.2 0.2 0.03 0.008\n"
+
+
 @pytest.mark.parametrize(
     "depth, lamps",
     [(5, False), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((2, False), (2, True), (5, True)))],
 )
 def test_lights_without_a_closed_form_are_seen_by_paths_beside_others(tmp_path, depth, lamps):
     """Against Mitsuba's own path tracer, with many lights of closed form and with the point light alone."""
-    (tmp_path / "hair.txt").write_text("-0.2 0.2 0.02 0.008\n0.0 0.23 0.06 0.008\n0.2 0.2 0.03 0.008\n")
-    text = SCENE.replace('"max_depth" value="2"', f'"max_depth" value="{depth}"')
-    text = text.replace('<emitter type="constant"><spectrum name="radiance" value="0.13"/></emitter>', "")
+    (tmp_path / "hair.txt").write_text(HAIR)
+    text = SCENE.replace('"max_depth" value="2"', f'"max_depth" value="{depth}"').replace(SKY, "")
     off = [] if lamps else ["lamp", "panel", "bulb"]
     scene = loaded(tmp_path, text.replace("</scene>", MORE), unlit=off)
     diffuse, sensor = build(mitsuba(), scene.spec).diffuse, hr.load_sensor("gen2").crop(60, 44, 1400, 1000)
@@ -525,11 +528,14 @@ def test_a_direct_integrator_has_depth_2(tmp_path):
 
 
 @pytest.mark.slow
-def test_moving_shapes_have_the_wanted_error_in_the_default_mode(tmp_path, monkeypatch):
+@pytest.mark.parametrize("more", [False, True])
+def test_moving_shapes_have_the_wanted_error_in_the_default_mode(tmp_path, monkeypatch, more):
     """A board with a picture slides and turns, and its shadows with it; errors in noise units against paths."""
     turn = "{t_us: 100000, translation_m: [0.2, 0.05, 0], rotation_axis: [0, 0, 1], rotation_deg: 40}"
     motion = f"[{{object: board, keyframes: [{{t_us: 0}}, {turn}]}}]"
-    scene, sensor = loaded(tmp_path, motion=motion), hr.load_sensor("davis346").crop(48, 36, 150, 110)
+    (tmp_path / "hair.txt").write_text(HAIR)
+    text = SCENE.replace(SKY, "").replace("</scene>", MORE) if more else SCENE
+    scene, sensor = loaded(tmp_path, text, motion), hr.load_sensor("davis346").crop(48, 36, 150, 110)
     flux = ChangeDrivenFlux(scene, sensor, 0.5, seed=6)
     blocks = list(flux.sample_blocks(1, 0, 5_000))
     pixels = np.arange(48 * 36, dtype=np.uint32)
@@ -540,7 +546,8 @@ def test_moving_shapes_have_the_wanted_error_in_the_default_mode(tmp_path, monke
     window, pixel = (index[np.random.default_rng(2).permutation(changes.sum())[:500]] for index in np.nonzero(changes))
     monkeypatch.setattr(surfaces, "_MOST_ENTRIES", 0)
     paths = pair_tracer(scene, sensor)
-    assert flux._renderer.tracer.is_diffuse and not paths.is_diffuse
+    own = flux._renderer.tracer
+    assert (own.is_diffuse, own.has_bounced) == (not more, more) and not (paths.is_diffuse or paths.has_bounced)
     places, windows = sensor.layout.full_index.ravel()[pixel], Windows(begin, end)
     given = places, window, windows, np.full(pixel.size, 4096), np.zeros(pixel.size, np.bool_)
     several = np.array([paths.trace(*given, repeat=k).mean for k in range(4)], np.float64)
