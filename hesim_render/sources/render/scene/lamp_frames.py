@@ -25,10 +25,11 @@ def lamp_frame(mi: MitsubaModule, shape: MitsubaObject) -> NDArray[np.float64] |
     if frame is None:
         return None
     width, height = frame[:3, 0].copy(), frame[:3, 1]
-    if abs(width @ height) > _RIGHT_ANGLED * np.linalg.norm(width) * np.linalg.norm(height):
+    area = np.linalg.norm(width) * np.linalg.norm(height)
+    if area == 0 or abs(width @ height) > _RIGHT_ANGLED * area:
         return None
     normals = np.array([np.array(shape.sample_position(0.0, mi.Point2f(*at)).n).ravel() for at in _PLACES], np.float64)
-    across = np.cross(width, height) / (np.linalg.norm(width) * np.linalg.norm(height))
+    across = np.cross(width, height) / area
     # a mesh may have normals of its vertices, by which it would shine
     if np.abs(normals @ across).min() < 1 - _RIGHT_ANGLED:
         return None

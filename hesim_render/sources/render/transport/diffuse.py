@@ -106,9 +106,9 @@ class DiffuseIntegrator:
         for shape in diffuse.glows.keys() - even.keys():
             rows.setdefault(shape, [0.0] * _ROW)[3] = -1.0
         self._has_others = bool(diffuse.others)
-        # what else shines: a picture of the sky, and shapes that do not shine evenly
-        self._has_map = scene.has_sky and not self._has_sky
-        self._has_unknown = self._has_map or len(even) < len(diffuse.glows)
+        # what rays may see of which paths say how bright it is: another sky, and shapes that do not shine evenly
+        self._has_other_sky = scene.has_sky and not self._has_sky
+        self._has_unknown = self._has_other_sky or len(even) < len(diffuse.glows)
         self._known: KnownTable | None = None
         if diffuse.glows or diffuse.more_lights:
             lamps = {light.shape for light in diffuse.lights if light.shape is not None}
@@ -201,7 +201,7 @@ class DiffuseIntegrator:
         source = dr.select(hit, mi.UInt32(dr.maximum(lamp - 1, 0)), mi.UInt32(lights_beside_sky))
         seen = dr.gather(mi.Float, self._emitted, source * self._filters + filter_index, emits)
         if self._has_unknown and self._paths is not None:
-            seen += self._paths.seen(si, dr.select(hit, lamp < 0, self._has_map), filter_index)
+            seen += self._paths.seen(si, dr.select(hit, lamp < 0, self._has_other_sky), filter_index)
 
         # light that a painted surface reflects
         painted = hit & (front & (sides > 0) | (sides > 1))
