@@ -49,6 +49,7 @@ def test_sections_stand_side_by_side(both):
     assert left == ["aps.html", "both.html", "c.yaml", "c_aps_maps-HASH.npz", "c_evs_maps-HASH.npz", "set"]
 
 
+@pytest.mark.slow
 def test_the_truth_of_a_virtual_session_stands_beside_its_estimates(both):
     """In the table of parameters, not as one line of all keys; one outside of its interval says so."""
     folder, _ = both
@@ -277,6 +278,7 @@ def test_no_dictionary_is_printed_and_notes_cannot_break_the_page(tmp_path):
     assert "x 0, y 4, width_px 32, height_px 32" in text and "k 0.25, t_ref_us 1000.0, filter own" in text
 
 
+@pytest.mark.slow
 def test_residuals_beyond_the_usual_are_drawn(again):
     """Every point handed to a panel lies within its axes."""
     drawn = 0

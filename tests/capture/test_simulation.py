@@ -116,6 +116,7 @@ def test_arguments_out_of_range(options):
         run("dark", "gen2", (16, 16), **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "how"),
     [

@@ -225,7 +225,7 @@ def test_the_readme_is_short_and_begins_with_two_commands_and_a_picture():
     assert (
         first == "python3 -m venv .venv && .venv/bin/pip install -q '.[llvm]' && .venv/bin/hesim-render demo --out demo"
     )
-    assert second.endswith(".venv/bin/python -m pytest -q -n 2")
+    assert second.endswith(".venv/bin/python -m pytest -q -n 3")
     assert text.index(second) < text.index("![") < text.index("\n## ") and text.count("![") == 1
     for linked in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
         assert (ROOT / linked).exists(), linked

@@ -581,6 +581,7 @@ def test_telegraph_pixels_of_frames_are_found(frames_session):
     assert section["read_noise_e"]["value"] == pytest.approx(6.0, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_calibrated_sensor_jumps_alike(frames_session):
     given, file, captures = frames_session
     again = hr.load_sensor("reference-mono", {"noise": str(file)}).crop(SIDE, SIDE)

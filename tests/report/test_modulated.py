@@ -72,6 +72,7 @@ def test_bursts_show_the_bandwidth_of_pixels_with_a_long_dead_time(tmp_path):
     assert found.entry["standard_error"] < 0.04 * corner_hz
 
 
+@pytest.mark.slow
 def test_continuous_modulation_does_not_and_says_so(tmp_path):
     found = figures.event_figures(band_bench(tmp_path / "always", False, 12))
     entry = next(one for one in found.entries if one.key == "bandwidth")

@@ -71,6 +71,7 @@ def value_at(pieces, x, y, wavelength_nm=550.0):
     return value, hits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", TARGETS, ids=str)
 def test_pieces_tile_the_rectangle_without_overlap(content):
     target = target_of(content)

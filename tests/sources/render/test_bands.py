@@ -66,6 +66,7 @@ def small_bands(monkeypatch):
     return lambda most: monkeypatch.setattr(adaptive, "pixels_at_once", lambda *_: most)
 
 
+@pytest.mark.slow
 def test_events_are_the_same_in_small_bands(small_bands):
     sensor = hr.load_sensor("davis346", {"evs.threshold_mismatch_rel": 0.02}).crop(46, 30, 151, 113)
 

@@ -244,6 +244,7 @@ def test_lines_follow_the_law_of_their_pair():
     assert given[1] is own.gain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of_changes", [False, True])
 def test_references_follow_the_law_of_paths_where_these_decide(of_changes):
     """By the law of closed forms everywhere, and by that of paths: more rays."""

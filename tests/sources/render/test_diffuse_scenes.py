@@ -395,6 +395,7 @@ def test_a_mesh_that_is_a_rectangle_gives_the_light_that_mitsuba_gives(tmp_path)
     assert_same(tracer, scene, sensor, rays=1024)
 
 
+@pytest.mark.slow
 def test_more_lights_than_a_kernel_holds_are_seen_by_paths(tmp_path, monkeypatch):
     monkeypatch.setattr(diffuse_scene, "_MOST_LIGHTS", 4)
     diffuse = build(mitsuba(), loaded(tmp_path).spec).diffuse
@@ -455,7 +456,7 @@ OTHERS = """
 </scene>"""
 
 
-@pytest.mark.parametrize("depth", [pytest.param(2, marks=pytest.mark.slow), 5])
+@pytest.mark.parametrize("depth", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_gloss_and_what_bounces_are_seen_by_paths_beside_closed_forms(tmp_path, depth):
     """Against Mitsuba's own path tracer. Light is sampled at what is glossy, and known at what is not."""
     text = SCENE.replace("</scene>", OTHERS).replace('"max_depth" value="2"', f'"max_depth" value="{depth}"')
@@ -492,7 +493,7 @@ HAIR = "-0.2 0.2 0.02 0.008\n0.0 0.23 0.06 0.008\n0.2 0.2 0.03 0.008\n"
 
 @pytest.mark.parametrize(
     "depth, lamps",
-    [(5, False), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((2, False), (2, True), (5, True)))],
+    [(2, False), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((5, False), (2, True), (5, True)))],
 )
 def test_lights_without_a_closed_form_are_seen_by_paths_beside_others(tmp_path, depth, lamps):
     """Against Mitsuba's own path tracer, with many lights of closed form and with the point light alone."""

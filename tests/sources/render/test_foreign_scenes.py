@@ -179,6 +179,7 @@ def test_a_pixel_in_which_no_ray_saw_light_states_the_error_that_is_wanted():
     assert rays[1] - rays[0] > 56 * 0.5 * dark.sum() and TUNING.dark_rays == 64
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["room", "floor-ball", *(pytest.param(name, marks=pytest.mark.slow) for name in ("copper", "glass-ball"))]
 )

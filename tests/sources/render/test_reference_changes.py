@@ -87,6 +87,7 @@ def test_changes_are_as_good_as_those_of_levels_from_a_part_of_the_rays(ball, mo
     assert before < 0.6 * (alone.rays_traced - before)
 
 
+@pytest.mark.slow
 def test_all_windows_of_a_unit_have_one_number_of_rays(monkeypatch):
     source, traced = source_of(), []
     trace = source._tracer.trace

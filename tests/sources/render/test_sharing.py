@@ -221,6 +221,7 @@ def test_paths_of_a_group_have_the_same_wavelengths(scene_of):
     assert abs(shared.mean() - alone.mean()) < 4 * spread and spread < 0.01 * alone.mean()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", ["roughplastic", "bumpmap"])
 def test_what_is_not_diffuse_keeps_its_own_light(scene_of, surface):
     """A wall before all others, and a floor that bounces light back to it."""

@@ -42,6 +42,7 @@ def swarm(rng, count=12):
     return objects, motion
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("rides", [False, True])
 def test_what_is_called_large_is_small_in_no_window(seed, rides):
