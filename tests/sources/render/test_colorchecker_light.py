@@ -91,14 +91,15 @@ def truth_of(view, sensor, illuminant):
     return flux * sensor.relative_illumination, part
 
 
-def chart_z(name, illuminant, f_number, quality, seeds):
-    """z of the sum over the pixels of each patch that an edge goes through, [seed, patch]; and other departures.
+def chart_z(name, illuminant, f_number, quality, seeds, together):
+    """z of the sum over the pixels of each patch that an edge goes through, and over some seeds together, [sum, patch];
+    and other departures.
 
     What a sum's error is said to be is taken from the halves of all seeds: of one seed at 8 rays a pixel they are few.
 
     Returns
     -------
-    z : see above. off : largest relative departure of a pixel inside a patch. bias : of each seed's whole picture.
+    z : see above. off : largest relative departure of a pixel inside a patch. bias : of whole pictures, [sum].
     """
     scene, given = chart_scene(illuminant, f_number), hr.load_sensor(name).crop(COLS, ROWS)
     pixels, sums, squares, off, bias = np.arange(ROWS * COLS, dtype=np.uint32), [], [], 0.0, []
@@ -114,19 +115,18 @@ def chart_z(name, illuminant, f_number, quality, seeds):
         sums.append([(flux - truth)[own].sum() for own in edge])
         squares.append([(half[own] ** 2).sum() for own in edge])
         bias.append(flux.sum() / truth.sum() - 1)
-    return np.array(sums) / np.sqrt(np.mean(squares, axis=0)), off, np.array(bias)
+    own = np.array(sums).reshape(-1, together, len(sums[0])).sum(axis=1)
+    z = own / np.sqrt(together * np.mean(squares, axis=0))
+    return z, off, np.array(bias).reshape(-1, together).mean(axis=1)
 
 
-def assert_unbiased(name, illuminant, f_number, quality, seeds=range(10)):
-    z, off, bias = chart_z(name, illuminant, f_number, quality, seeds)
-    assert z.size == 24 * len(seeds)
+def assert_unbiased(name, illuminant, f_number, quality, together=1):
+    z, off, bias = chart_z(name, illuminant, f_number, quality, range(10 * together), together)
+    assert z.size == 240
     # float32 of a sum over a table of wavelengths
     assert off < 1e-5
     # 240 z of variance 1 (each of some 40 pixels): the mean is off by 0.22 with probability 7e-4
-    assert abs(z.mean()) < 0.22
-    # tails of few rays are heavy; the fourth moment says how well 240 z tell their standard deviation
-    spread = np.sqrt((stats.kurtosis(z, axis=None, fisher=False) - 1) / (4 * z.size))
-    assert abs(z.std() - 1) < max(0.15, 3.5 * spread)
+    assert abs(z.mean()) < 0.22 and 0.85 < z.std() < 1.15
     assert np.abs(z).max() < 5
     error = bias.std(ddof=1) / np.sqrt(bias.size)
     if error < 5e-4 / 3:
@@ -143,8 +143,8 @@ def test_chart():
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_chart_under_all_lights(name, quality):
-    """Pooled over 12 lights and apertures: 2880 z."""
-    z = np.concatenate([assert_unbiased(name, light, f, quality) for light in ILLUMINANTS for f in F_NUMBERS])
+    """Pooled over 12 lights and apertures: 2880 z, of four seeds each: of few rays, those of one have heavy tails."""
+    z = np.concatenate([assert_unbiased(name, light, f, quality, 4) for light in ILLUMINANTS for f in F_NUMBERS])
     assert abs(z.mean()) < 0.15 and 0.9 < z.std() < 1.1
 
 
@@ -203,4 +203,4 @@ def test_image_of_a_plastic_ball():
 
 @pytest.mark.slow
 def test_image_of_a_rough_ball_with_interreflection():
-    assert_right_mean(glossy_ball("roughplastic", 4), range(88))
+    assert_right_mean(glossy_ball("roughplastic", 4), range(64))

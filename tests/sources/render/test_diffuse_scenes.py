@@ -15,6 +15,7 @@ from hesim_render.sources.render.scene import diffuse_scene, surfaces
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.direct_lights import DirectLight
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba, names_of
+from hesim_render.sources.render.transport import known_lights
 from hesim_render.sources.render.transport.leaving import Leaving
 from hesim_render.sources.render.transport.light_sources import light_source
 from hesim_render.spectral.spectrum import constant
@@ -197,7 +198,7 @@ def test_objects_that_shine_are_seen_in_closed_form():
 
 @pytest.mark.parametrize("depth", [pytest.param(2, marks=pytest.mark.slow), 4])
 def test_boxes_that_shine_and_maps_of_scene_files_are_seen_by_paths_beside_lamps(tmp_path, depth):
-    """A box, a ball of plastic and a printed lamp of a target that shine, under a lamp and a map of the sky."""
+    """A box and a ball of plastic that shine, under a lamp and a map of the sky."""
     Image.fromarray(np.random.default_rng(5).integers(20, 250, (5, 8, 3), dtype=np.uint8)).save(tmp_path / "sky.png")
     floor = {"name": "floor", "shape": "rectangle", "size_m": [1.2, 1.1, 0], "reflectance": 0.7}
     block = {"name": "block", "shape": "box", "size_m": [0.1, 0.2, 0.02], "position_m": [-0.3, -0.1, 0.12]}
@@ -216,6 +217,23 @@ def test_boxes_that_shine_and_maps_of_scene_files_are_seen_by_paths_beside_lamps
     tracer = pair_tracer(scene, sensor)
     assert tracer.has_bounced
     assert_same(tracer, scene, sensor, rays=1024, most=20)
+
+
+def test_maps_are_known_by_their_place_among_the_lights_of_a_scene_file(tmp_path):
+    Image.fromarray(np.full((4, 6, 3), 90, dtype=np.uint8)).save(tmp_path / "sky.png")
+    given = [
+        {"type": "environment", "file": str(tmp_path / "sky.png"), "illuminance_lux": 20},
+        {"type": "area", "illuminance_lux": 30, "position_m": [0.5, 0.4, 1.3], "size_m": [0.5, 0.3]},
+        {"type": "point", "illuminance_lux": 50, "position_m": [0.3, 0.1, 1.2]},
+        {"type": "directional", "illuminance_lux": 40, "direction": [0.1, 0.2, -1]},
+    ]
+    floor = [{"name": "floor", "shape": "rectangle", "size_m": [1.2, 1.1, 0], "reflectance": 0.4}]
+    camera = {"origin_m": [0.0, 0.05, 2], "target_m": [0.0, 0, 0], "horizontal_fov_deg": 22.62}
+    for place in range(4):
+        lights = [*given[1 : place + 1], given[0], *given[place + 1 :]]
+        built = build(mitsuba(), make_scene(objects=floor, light=lights, camera=camera, max_depth=2).spec)
+        apart = [light.is_environment() for light in built.scene.emitters() if light.get_shape() is None]
+        assert len(apart) == 3 and built.diffuse.more_lights == np.flatnonzero(apart).tolist()
 
 
 def test_lamps_of_a_grid_are_seen_in_the_light_of_another(tmp_path):
@@ -407,6 +425,9 @@ def test_more_lights_than_a_kernel_holds_are_seen_by_paths(tmp_path, monkeypatch
     assert list(diffuse.glows) == ["panel", "bulb"] and diffuse.more_lights == [0, 2, 1]
     assert tracer.has_bounced
     assert_same(tracer, scene, sensor, rays=1024, most=20)
+    # where the others cannot be drawn alone, samples of known lights count for nothing
+    monkeypatch.setattr(known_lights, "_MOST_RUNS", 0)
+    assert_same(pair_tracer(scene, sensor), scene, sensor, rays=1024, most=20)
 
 
 def test_a_scene_whose_lights_all_lack_a_closed_form_is_seen_by_paths(tmp_path):

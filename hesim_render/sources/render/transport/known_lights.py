@@ -1,7 +1,8 @@
 """Lights whose direct light is known on some surfaces, which paths leave out there.
 
-Paths from these surfaces sample the other lights alone: as Mitsuba draws a light by the place of a random number among
-shares of all lights, a number is mapped into those of the others, whose densities rise as much.
+Paths from these surfaces sample the other lights alone. Mitsuba gives each light a share of [0, 1), and draws the one
+in whose share a random number lies. Here the number is mapped into the shares of the other lights, and their densities
+are multiplied by one over the length of these shares.
 """
 
 from collections.abc import Collection, Sequence
