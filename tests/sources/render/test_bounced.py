@@ -22,6 +22,7 @@ from hesim_render.sources.render.change_driven.plan import Plan, plan
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.scene import surfaces
+from hesim_render.sources.render.transport.paths import PathIntegrator
 
 WHERE = Windows(np.array([0.0]), np.array([400.0]))
 BALL = {"name": "ball", "shape": "sphere", "size_m": [0.05] * 3, "position_m": [0.06, 0.03, 0.05],
@@ -127,7 +128,9 @@ def test_a_ball_of_plastic_does_not_make_a_scene_dear(monkeypatch):
         given = sensor.layout.full_index.ravel()[pixel], window, Windows(begin, end), np.full(pixel.size, 4096)
         several = [tracer.trace(*given, np.zeros(pixel.size, np.bool_), repeat=k).mean for k in range(4)]
         off = (seen[0][window, pixel] - np.mean(several, axis=0, dtype=np.float64)) / unit[window, pixel]
-        assert pixel.size > 200 and np.sqrt(np.mean(off**2)) < 0.5
+        # single pairs that change are far off, where few rays about a line have met what the line does not know
+        assert pixel.size > 200 and np.quantile(np.abs(off), 0.95) < 0.8
+        assert which is changes or np.sqrt(np.mean(off**2)) < 0.3
 
 
 def test_what_passes_before_a_lamp_of_glossy_things_comes_near():
@@ -170,6 +173,40 @@ def test_a_lamp_in_a_mirror_is_as_bright_as_by_paths_alone(monkeypatch, depth):
     assert alone.max() > 5 * np.median(alone), "the mirror does not show the lamp"
     # but in the shadow of the mirror, of which either has few rays
     assert np.isclose(both, alone, rtol=0.02).mean() > 0.97
+
+
+@pytest.mark.parametrize("with_lamp", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_ray_brings_the_light_of_the_sky_or_of_what_hides_it(monkeypatch, with_lamp):
+    """A card that turns beside a bright wall, below a sky: h is 1 where the wall hides it, which sends L in place of S.
+    One direction for both scatters by (S - L)²·h(1 - h), two by (S² + L²)·h(1 - h).
+    """
+    tilt = {"rotation_axis": [0.2, 1, 0], "rotation_deg": 25}
+    lamp = {"position_m": [0.5, -1.2, 2.5], "size_m": [0.2, 0.3], "illuminant": "D65", "illuminance_lux": 300}
+    light = [D65_1000_LUX, {"type": "area", **lamp}] if with_lamp else D65_1000_LUX
+    scene = make_scene(
+        objects=[
+            {"name": "card", "shape": "rectangle", "size_m": [0.5, 0.4, 0], "reflectance": 0.4},
+            # on edge to the camera
+            {"name": "wall", "shape": "box", "size_m": [0.02, 1.7, 1.4], "position_m": [-0.3, 0.1, 0.6],
+             "reflectance": 0.93},
+        ],
+        light=light, max_depth=3, camera={"origin_m": [0, 0, 2], "target_m": [0, 0, 0], "horizontal_fov_deg": 9},
+        motion=[{"object": "card", "keyframes": [{"t_us": 0, **tilt}, {"t_us": 50_000, **tilt, "rotation_deg": 38}]}],
+    )  # fmt: skip
+    sensor, count = mono(12, 9), 12 * 9
+    given = sensor.layout.full_index.ravel(), np.zeros(count, np.int64), WHERE, np.full(count, 64)
+
+    def of_repeats(tracer, controlled):
+        means = [tracer.trace(*given, np.full(count, controlled), repeat=k).mean for k in range(40)]
+        return np.mean(means, axis=0), np.var(means, axis=0, ddof=1).mean()
+
+    together, square = of_repeats(pair_tracer(scene, sensor), False)
+    monkeypatch.setattr(PathIntegrator, "sees_images", property(lambda paths: True))
+    _, apart = of_repeats(pair_tracer(scene, sensor), False)
+    monkeypatch.setattr(surfaces, "_MOST_ENTRIES", -1)
+    alone, _ = of_repeats(pair_tracer(scene, sensor), False)
+    assert square < 0.5 * apart
+    np.testing.assert_allclose(together, alone, rtol=0.02)
 
 
 def test_aimed_rays_bring_by_paths_what_they_bring_where_nothing_else_is_seen():
@@ -256,8 +293,8 @@ def test_references_follow_the_law_of_paths_where_these_decide(of_changes):
         if of_changes:
             end = np.repeat(ends[:, None], pixel.size, axis=1)
             planned = source._references._planned(source._index[pixel], end - 100, end, 0, 0.1)
-            # most of the sky is open, and lets the closed form scatter less
-            assert set(np.unique(planned[2])) == {0.0, 1.0} and planned[2].mean() > 0.5
+            # where most of the sky is open, the closed form scatters less
+            assert set(np.unique(planned[2])) == {0.0, 1.0} and 0.3 < planned[2].mean() < 0.7
             rays.append(int((planned[0] * planned[1]).sum()))
         else:
             source.reference_flux(pixel, np.full(pixel.size, 300.0), np.full(pixel.size, 400.0), 0.1, True)

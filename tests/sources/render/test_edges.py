@@ -2,16 +2,18 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
-from rendering import make_scene, pair_tracer
+from rendering import D65_1000_LUX, make_scene, pair_tracer
 from scipy import stats
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.host_arrays import from_host
 from hesim_render.core.rng import Stream
+from hesim_render.sources.render.change_driven import adaptive
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
 from hesim_render.sources.render.change_driven.edge_share import halfplane_share, moving_share
 from hesim_render.sources.render.change_driven.edges import EdgeFit, LaneEdges, PairEdges
@@ -241,6 +243,51 @@ def test_a_run_takes_lines_where_there_are_some():
     assert np.sqrt(np.mean(((found[256] - found[1 << 14]) / unit) ** 2)) < 0.5
 
 
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)])
+def test_a_corner_beside_a_line_is_worth_two_wanted_errors_where_pixels_rest(seed):
+    """Decision rays that miss the corner of a square find a line without it, and each ray of the picture that meets the
+    corner then weighs the more, the fewer rays there are. Of resting pixels, whose flux counts for long.
+    """
+    speck = {"name": "speck", "shape": "sphere", "size_m": [0.04] * 3, "position_m": [-0.21, 0.13, 0.1]}
+    scene = make_scene(
+        target={"type": "checkerboard", "width_m": 0.5, "height_m": 0.4, "rows": 12, "cols": 13, "light": 0.8,
+                "dark": 0.05},
+        objects=[{**speck, "reflectance": 0.3}], light=D65_1000_LUX,
+        camera={"origin_m": [0.013, 0.007, 2], "target_m": [0.013, 0.007, 0], "horizontal_fov_deg": 16},
+        motion=[{"object": "speck", "keyframes": [{"t_us": 0}, {"t_us": 50_000, "translation_m": [0.01, 0.003, 0]}]}],
+    )  # fmt: skip
+    sensor = hr.load_sensor("davis346").crop(48, 36)
+    source = ChangeDrivenFlux(scene, sensor, seed=seed)
+    pixel = np.arange(48 * 36, dtype=np.uint32)
+    first = next(iter(source.flux_of_blocks(pixel, source.sample_blocks(1, 0, 1000))))
+    found = 0.5 * (np.array(first.half_a, np.float64) + np.array(first.half_b))
+    tracer = pair_tracer(scene, sensor, 71)
+    given = sensor.layout.full_index.ravel(), np.zeros(pixel.size, np.int64), Windows(np.zeros(1), np.ones(1))
+    many = *given, np.full(pixel.size, 4096), np.ones(pixel.size, np.bool_), Stream.AUDIT
+    truth = np.mean([tracer.trace(*many, repeat=k).mean.astype(np.float64) for k in range(6)], axis=0)
+    off = np.abs(found - truth) / source.noise_unit(pixel, truth, True)
+    # by what lines alone ask for, 0.24 to 0.28, and five pixels or more are off by more than two
+    assert np.sqrt(np.mean(off**2)) < 0.19 and np.count_nonzero(off > 2) < 3
+
+
+def test_lines_in_anchors_are_those_with_more_rays():
+    """The first anchor, where a run begins, and the one after 64 ms."""
+    source, asked = ChangeDrivenFlux(plates(), hr.load_sensor("davis346").crop(20, 14), seed=3), {}
+    given = adaptive.about_edges
+
+    def noted(tracer, pairs, *rest, contrast_rays, **more):
+        used = np.unique(pairs[1])
+        asked.setdefault(contrast_rays, set()).update(pairs[2].end_us[used].tolist())
+        return given(tracer, pairs, *rest, contrast_rays=contrast_rays, **more)
+
+    with mock.patch.object(adaptive, "about_edges", noted):
+        for _ in source.flux_of_blocks(np.arange(20 * 14, dtype=np.uint32), source.sample_blocks(1, 0, 65_000)):
+            pass
+    # at a weight of a ray of two wanted errors
+    assert asked.keys() == {0.0, 1.0} and asked[1.0] == {0.0, 64_000.0}
+    assert min(asked[0.0]) < 2 and max(asked[0.0]) > 64_000
+
+
 def test_rays_follow_from_what_the_decision_rays_saw():
     """Fits as given, of pairs 0.8 as bright as the axis; the wanted error is 2 e⁻/s, which is 2.5 on the axis."""
     contrast = np.array([250.0, 2500.0, 1.5, 1.5, 250.0, 250.0, 250.0, 250.0])  # 100, 1000, 0.6 wanted errors, …
@@ -289,6 +336,11 @@ def test_rays_follow_from_what_the_decision_rays_saw():
     moving = Tracer()
     moving.moves = True
     assert about_edges(moving, (pixel, 0 * pixel, None), *given)[0].tolist() == [64, 512, 256, 32, 128, 512, 256, 128]
+    # a caller may ask for more of lines alone, 0.9 and 0.3: 90 and 900, and no fewer than a moving line takes
+    more = {"contrast_rays": 0.9}
+    assert about_edges(Tracer(), (pixel, 0 * pixel, None), *given, **more)[0][:4].tolist() == [128, 1024, 256, 32]
+    more = {"contrast_rays": 0.3}
+    assert about_edges(moving, (pixel, 0 * pixel, None), *given, **more)[0][:4].tolist() == [64, 512, 256, 32]
 
 
 def without_lines(contrast, scatter, fewer, law, moves):

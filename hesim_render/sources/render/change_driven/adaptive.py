@@ -248,6 +248,7 @@ class AdaptiveRenderer:
         first: Flux | None = None,
         fit: EdgeFit | None = None,
         link: Link | None = None,
+        is_anchor: bool = False,
     ) -> tuple[Flux, NDArray[np.bool_]]:
         """Render the pairs that a plan names, except differences, which need an anchor; see `Anchor.render`.
 
@@ -257,6 +258,7 @@ class AdaptiveRenderer:
         first : [1, n], flux in the first window, if it is already known.
         fit : lines of the pairs `fitted` of the plan, where they are known.
         link : renders linked pairs as differences, see `Anchor.link`; None where there are none.
+        is_anchor : True where the flux counts for all of a long time, as that of event pixels that rest.
 
         Returns
         -------
@@ -271,7 +273,7 @@ class AdaptiveRenderer:
         window, place = np.nonzero(todo)
         aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
         pairs = band.index[place], numbers[todo], windows
-        rays, edges = self.rays_of(pairs, what, todo, aims, fit)
+        rays, edges = self.rays_of(pairs, what, todo, aims, fit, is_anchor)
         shared = None if what.shared is None else what.shared[todo]
         shadows = None if what.shadows is None else what.shadows[todo]
         got = self.sharing.trace((*pairs, rays, what.controlled[todo]), shared, span_us, aims, edges, shadows)
@@ -296,6 +298,7 @@ class AdaptiveRenderer:
         todo: NDArray[np.bool_],
         aims: PairAims | None,
         fit: EdgeFit | None = None,
+        is_anchor: bool = False,
     ) -> tuple[NDArray[np.integer], PairEdges | None]:
         """Numbers of rays of the pairs `todo` of a plan, and models of their edges; this traces decision rays.
 
@@ -304,6 +307,7 @@ class AdaptiveRenderer:
         pairs : pixels on the full sensor, their windows, and all windows.
         aims : small objects of these pairs, at which rays are aimed.
         fit : lines of the pairs `fitted` of the plan, where they are known.
+        is_anchor : see `render`.
         """
         rays: NDArray[np.integer] = what.rays[todo]
         if not self.tracer.rays.is_box:
@@ -314,4 +318,7 @@ class AdaptiveRenderer:
         shadows, gain = None if what.shadows is None else what.shadows[todo], self.gain
         if what.bounces is not None:
             gain = gain.or_other(Gain(*self.tuning.path_gain), what.bounces[todo])
-        return about_edges(*(self.tracer, pairs, *given, gain, self.tuning), tried=tried, known=known, shadows=shadows)
+        # half of the rays are uniform: one that finds the line wrong weighs twice its contrast over their number
+        least = 2 / self.tuning.ray_weight if is_anchor else 0.0
+        of = self.tracer, pairs, *given, gain, self.tuning
+        return about_edges(*of, tried=tried, contrast_rays=least, known=known, shadows=shadows)

@@ -239,7 +239,8 @@ class Anchor:
         if new.any():
             renderer, band = self._renderer, self._band
             what = replace(self._own_plan(), rendered=new[None])
-            flux, _ = renderer.render(band, self._windows, np.zeros((1, new.size), np.int64), what)
+            numbers = np.zeros((1, new.size), np.int64)
+            flux, _ = renderer.render(band, self._windows, numbers, what, is_anchor=True)
             self._flux.put(new, flux.at(new))
             self._is_known |= new
         return self._flux.at(place)

@@ -22,6 +22,7 @@ def about_edges(
     *,
     tried: NDArray[np.bool_] | None = None,
     flat_part: float | None = None,
+    contrast_rays: float = 0.0,
     known: tuple[NDArray[np.bool_], EdgeFit] | None = None,
     shadows: NDArray[np.uint32] | None = None,
     stream: Stream = Stream.RENDER_EDGE,
@@ -42,6 +43,7 @@ def about_edges(
     tuning : constants.
     tried : [n], pairs that may have an edge; None for all.
     flat_part : in place of `Tuning.flat_part`.
+    contrast_rays : least rays of a pair with a line for each wanted error of contrast, if `Tuning` has fewer.
     known : [n], pairs whose lines are known, and these lines.
     shadows : [n], see `PairTracer.trace`.
     stream : stream of the decision rays.
@@ -81,7 +83,7 @@ def about_edges(
     # what moves within the window passes by more of the decision rays than a sliver that rests, so these tell enough
     is_flat = ~is_edge & ((contrast < tuning.low_contrast) | moves)
     # an edge: its contrast says how much a ray weighs that finds the model wrong; half of the rays start in the strip
-    per_contrast = tuning.moving_contrast_rays if moves else tuning.edge_contrast_rays
+    per_contrast = max(contrast_rays, tuning.moving_contrast_rays if moves else tuning.edge_contrast_rays)
     needed = np.where(is_edge, np.maximum(2 * by_scatter, per_contrast * contrast), by_scatter)
     # the neighbours gave this pair its rays, and what they show does not reach it
     part = tuning.flat_part if flat_part is None else flat_part

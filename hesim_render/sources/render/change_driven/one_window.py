@@ -68,7 +68,7 @@ def render_one_window(
             what = renderer.plan(pilot, band, is_knot=role == "events")
             if role == "events":
                 what = renderer.sharing.planned(what, band, renderer.counts)
-            flux, met = renderer.render(band, windows, own[None], what, still.span_us)
+            flux, met = renderer.render(band, windows, own[None], what, still.span_us, is_anchor=role == "events")
             out.put(place, flux)
             if still.span_us is not None:
                 fixed = ~(band.sites.most(near, REACH) | met[0])

@@ -5,8 +5,10 @@ other surfaces, what other lights give them, and all light of surfaces that are 
 first vertex is what the ray has hit.
 """
 
+from math import pi
+
 from hesim_render.core.device import dr
-from hesim_render.core.device_types import Float, Mask, MitsubaObject, Ray, UInt32
+from hesim_render.core.device_types import Float, Mask, MitsubaObject, Ray, UInt32, Vector3
 from hesim_render.sources.render.transport.known_lights import KnownLights
 from hesim_render.sources.render.transport.moving_scene import Surface
 from hesim_render.sources.render.transport.paths import Begun, PathIntegrator
@@ -23,6 +25,7 @@ def bounced_flux(
     painted: Mask,
     other: Mask | None,
     known: KnownLights | None,
+    onward: Vector3 | None,
 ) -> tuple[Float, Mask]:
     """Flux of what paths find beside closed forms, without what the surface itself emits.
 
@@ -34,6 +37,9 @@ def bounced_flux(
     painted : lanes of which the direct light of some lights is known.
     other : lanes with surfaces that are not diffuse; None if the scene has none.
     known : lights of which it is known; None for all.
+    onward : direction in which paths go on from painted lanes, with a cosine distribution about the normal; None: one
+        of their own. With that of the shadow ray to a sky, a ray brings either the sky's light or that of what hides
+        the sky, which differ less from ray to ray than the light of two directions.
 
     Returns
     -------
@@ -48,6 +54,10 @@ def bounced_flux(
     place, lobe, light, _ = sampler.next_vertex(mi.Bool(True))
     given = surface, moment, goes_on, mi.Bool(paths.bounces), (place, lobe, light)
     reflected, chosen, weight, met = paths.scatter(*given, asks, known)
+    if onward is not None and not paths.sees_images:
+        # the weight of a diffuse surface is the same in all directions; cones about images of lamps change it
+        chosen.wo = dr.select(painted, surface.to_local(onward), chosen.wo)
+        chosen.pdf = dr.select(painted, dr.abs(mi.Frame3f.cos_theta(chosen.wo)) / pi, chosen.pdf)
     goes_on = goes_on & dr.any(weight != 0)
     following = scene.leaving.along(surface.world, surface.to_world(chosen.wo))
     following.wavelengths = ray.wavelengths

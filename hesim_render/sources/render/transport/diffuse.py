@@ -207,11 +207,14 @@ class DiffuseIntegrator:
         painted = hit & (front & (sides > 0) | (sides > 1))
         normal = mi.Vector3f(surface.shading_normal)
         normal = dr.select(front, normal, -normal)
-        controlled, plain, unshadowed = seen, seen, seen
+        controlled, plain, unshadowed, onward = seen, seen, seen, None
         for number, light in enumerate(self._lights):
             open_, share, shadow = light.seen_from(surface.world, normal, sampler)
             # a lamp that is painted as well gives no light to itself; rounding would say it does
             asks = painted & (open_ > 0) & (lamp != number + 1)
+            if isinstance(light, Sky):
+                # what hides the sky here sends light by a path
+                onward = shadow.d
             blocked, near = scene.occluded(shadow, moment, asks)
             met |= near
             scale = dr.gather(
@@ -246,7 +249,7 @@ class DiffuseIntegrator:
                 other = hit & (dr.gather(mi.Float, self._rows, 4 * first + _ROW - 1, hit) > 0)
             known = None if self._known is None else self._known.where(painted)
             of_paths = self._paths, sampler, surface, ray, moment, filter_index
-            bounced, near = bounced_flux(*of_paths, painted, other, known)
+            bounced, near = bounced_flux(*of_paths, painted, other, known, onward)
             met |= near
             controlled, plain, unshadowed = controlled + bounced, plain + bounced, unshadowed + bounced
         # known shadows are known in all windows, so there is no choice

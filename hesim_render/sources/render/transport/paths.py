@@ -89,6 +89,11 @@ class PathIntegrator:
         return self._max_depth > 2
 
     @property
+    def sees_images(self) -> bool:
+        """True if directions of diffuse surfaces are drawn from the cones about mirrored lamps as well."""
+        return bool(self._images)
+
+    @property
     def may_share(self) -> bool:
         """True if there are second vertices that neighbours may share; the chance of cones depends on the place."""
         return self._max_depth > 2 and not self._images
