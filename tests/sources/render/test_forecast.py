@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render.mosaic.schedule import BlockSample, Exposure, tick_blocks
+from hesim_render.mosaic.schedule import Block, BlockSample, Exposure, tick_blocks
 from hesim_render.sources.render.change_driven import forecast, foresight
 from hesim_render.sources.render.change_driven.anchor import anchor_us
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
@@ -84,6 +84,20 @@ def test_the_first_pilot_goes_on_where_nearly_all_pixels_may_change(constant, sa
     assert estimate.ray_s == pytest.approx(3.033e-6) and estimate.trace_s == 0.04
     many = replace(demand, event_pixel=np.arange(3 << 17, dtype=np.uint32))
     assert forecast.forecast(source, many).seconds > 0.04 * 7 * len(blocks) * 2 + 3e-6 * 64 * (3 << 17)
+
+
+def test_the_window_with_which_a_run_begins_costs_nothing():
+    pixels, every = np.arange(800, dtype=np.uint32), np.array([-1.0, 340, 800, 1200])
+    block = Block(every, every + 1, np.array([False, True, True, True]))
+    first = Block(np.zeros(1), np.ones(1), np.ones(1, np.bool_))
+    rays = []
+    for blocks, count in (([first, block, block], 0.25), ([block, block], 1.0)):
+        sample = BlockSample(blocks, count)
+        estimate = forecast.forecast(Counted(0.3), Demand(2_000, pixels, sample, np.empty(0, np.uint32), []))
+        rays.append((estimate.rays, sample.count))
+    # 560 pixels may change: 70 rays and 30 of pilots a block, and 20 in the one anchor
+    assert rays == [(pytest.approx(800 * 96 + 560 * (100 * (count - share) + 20)), count)
+                    for (_, count), share in zip(rays, (1, 0), strict=True)]  # fmt: skip
 
 
 #: A plate flies past one corner of the picture; most of the wall never sees it.

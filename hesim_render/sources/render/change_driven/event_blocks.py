@@ -8,7 +8,7 @@ windows.
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import zip_longest
+from itertools import islice, tee, zip_longest
 from typing import Any
 
 import numpy as np
@@ -78,14 +78,33 @@ class Blocks:
         #: Window whose flux is `_last`.
         self._time: tuple[float, float] | None = None
         self._last = known
+        #: Flux of the next block, where it is known already.
+        self._next: BlockFlux | None = None
 
     def through(self, blocks: Iterable[Block]) -> Iterator[tuple[Block, "BlockFlux"]]:
         """Successive blocks, and what `take` gives for each."""
-        for block in blocks:
-            yield block, self.take(block)
+        for block, following in with_next(blocks):
+            yield block, self.take(block, following)
 
-    def take(self, block: Block) -> "BlockFlux":
-        """Flux of the pixels that may change; with that of the others where few are constant."""
+    def take(self, block: Block, following: Block | None = None) -> "BlockFlux":
+        """Flux of the pixels that may change; with that of the others where few are constant.
+
+        Parameters
+        ----------
+        block : its windows.
+        following : the block after it; None if there is none.
+        """
+        if self._next is not None:
+            out, self._next = self._next, None
+            return out
+        if following is not None and is_between(block, following):
+            # it is interpolated like any other window in which nothing bends
+            self._next = self._taken(following)
+            return self._next.between(0.5 * float(block.begin_us[0] + block.end_us[0]))
+        return self._taken(block)
+
+    def _taken(self, block: Block) -> "BlockFlux":
+        """See `take`."""
         windows = Windows(block.begin_us, block.end_us)
         # the block begins with the window that ended the one before, whose flux is known
         is_next = self._time == (block.begin_us[0], block.end_us[0])
@@ -163,6 +182,20 @@ class Blocks:
             shares = anchor.shares, ending.shares
         what = renderer.plan(pilot, band, is_knot=True, windows=windows, shares=shares)
         return what.until(int(np.flatnonzero(block.wanted)[-1]))
+
+
+def is_between(block: Block, following: Block) -> bool:
+    """True for a single window between the first two of the block that follows: the one with which a run begins."""
+    begin, end = block.begin_us, block.end_us
+    if begin.size != 1 or following.begin_us.size == 1:
+        return False
+    return bool(following.begin_us[0] <= begin[0] and end[0] <= following.end_us[1])
+
+
+def with_next(blocks: Iterable[Block]) -> Iterator[tuple[Block, Block | None]]:
+    """Blocks, and the one after each; None after the last one."""
+    these, those = tee(blocks)
+    return zip_longest(these, islice(those, 1, None))
 
 
 @dataclass(frozen=True)
@@ -249,6 +282,14 @@ class _BetweenKnots:
         result[:, ended[self._pair[ended] // centre.size != window]] = 0
         return result
 
+    def soon(self, centre_us: float) -> Flux:
+        """Flux at a time between the middles of the first two windows, [1, n]."""
+        values, centre = self.at(0), self._knots.centre_us
+        span = centre - centre[0]
+        way = ((centre_us - centre[0]) / np.where(span > 0, span, np.inf)).astype(np.float32)
+        # the first knot is that of the first window, so that its number is that of the next one
+        return Flux(*(values + way[self._pair] * self._change)[:, None])
+
 
 class BlockFlux:
     """Flux of pixels in the windows of a block.
@@ -272,6 +313,14 @@ class BlockFlux:
         begins = np.cumsum([0, *(each._size for each in lists)])
         begun = zip(begins[:-1].tolist(), lists, strict=True)
         return cls(int(begins[-1]), [(begin + place, knots) for begin, each in begun for place, knots in each._parts])
+
+    def between(self, centre_us: float) -> "BlockFlux":
+        """A single window whose middle lies between those of the first two."""
+        centre, parts = np.array([centre_us]), []
+        for (place, _), own in zip(self._parts, self._between, strict=True):
+            flux = own.soon(centre_us)
+            parts.append((place, Knots.of(flux, np.ones(flux.error.shape, np.bool_), centre)))
+        return BlockFlux(self._size, parts)
 
     def at(self, window: int) -> Flux:
         """Flux in one window, [1, size]; quick for windows one after the other."""

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from hesim_render.sources.render.change_driven.adaptive import pixels_at_once
 from hesim_render.sources.render.change_driven.anchor import anchor_us, period_us
+from hesim_render.sources.render.change_driven.event_blocks import is_between
 from hesim_render.sources.render.change_driven.one_window import FEW
 from hesim_render.sources.renderer import Demand, Estimate
 
@@ -50,7 +51,10 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
     # rays of the picture and of pilots, and traces
     picture, pilots, traces, windows, beside_s = 0.0, 0.0, 0.0, 0, 0.0
     if event_pixel.size and demand.blocks.blocks:
-        every = demand.blocks.blocks
+        every, count = demand.blocks.blocks, demand.blocks.count
+        if len(every) > 1 and is_between(*every[:2]):
+            # the window with which a run begins costs nothing
+            every, count = every[1:], count - 1
         windows = max(block.wanted.size for block in every)
         chosen = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, _BLOCKS).astype(int))]
         patch = _sample(event_pixel, source, "events", rng)
@@ -76,12 +80,12 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         # where nearly all may change, the pilot of the first anchor goes on
         saved = float(first.rays[3]) if 1 - alive_part <= FEW else 0.0
         share = np.mean([np.ptp(block.end_us) / period_us(block.end_us, source.has_ticks) for block in chosen])
-        more_anchors = max(0.0, float(np.ceil(demand.blocks.count * share)) - 1)
-        rest = begin + each * demand.blocks.count + anchors * more_anchors + compared * (1 + more_anchors)
+        more_anchors = max(0.0, float(np.ceil(count * share)) - 1)
+        rest = begin + each * count + anchors * more_anchors + compared * (1 + more_anchors)
         picture += float(first.rays[0] + alive_part * rest) * event_pixel.size
-        pilots += float(first.rays[3] + alive_part * (looks * demand.blocks.count - saved)) * event_pixel.size
+        pilots += float(first.rays[3] + alive_part * (looks * count - saved)) * event_pixel.size
         bands = np.ceil(alive_part * event_pixel.size / event_band)
-        traces += float(bands * np.mean([block.traces for block in blocks]) * demand.blocks.count)
+        traces += float(bands * np.mean([block.traces for block in blocks]) * count)
         beside_s = (picture + pilots) * _BESIDE_S
     # frames; of a static scene each pixel once, those of events included
     pixel = demand.pixels if is_static else np.unique(demand.frame_pixel if exposures else demand.frame_pixel[:0])

@@ -17,7 +17,7 @@ from hesim_render.core.workers import Ticket, Workers
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.change_driven.estimates import Counts, Flux
-from hesim_render.sources.render.change_driven.event_blocks import BlockFlux
+from hesim_render.sources.render.change_driven.event_blocks import BlockFlux, with_next
 
 #: Largest number of strips of a worker, and least number of rows of a strip, where there is more than one.
 _STRIPS, _LEAST_ROWS = 4, 16
@@ -140,8 +140,8 @@ class SharedBlocks:
     def through(self, blocks: Iterable[Block]) -> Iterator[tuple[Block, BlockFlux]]:
         """See `Blocks.through`. The workers begin with the next blocks while one is used."""
         asked: deque[tuple[Block, list[Ticket]]] = deque()
-        for block in blocks:
-            asked.append((block, [self._shares.ask(number, "take", block) for number in self._workers]))
+        for block, following in with_next(blocks):
+            asked.append((block, [self._shares.ask(number, "take", block, following) for number in self._workers]))
             if len(asked) > _AHEAD:
                 yield self._joined(*asked.popleft())
         while asked:
