@@ -133,9 +133,9 @@ def test_a_block_is_rendered_when_the_one_before_is_no_longer_held(monkeypatch):
     source = ChangeDrivenFlux(hr.load_scene("rotating-star"), sensor, seed=6)
     take, taken = Blocks.take, []
 
-    def watched(self, block):
+    def watched(self, block, following):
         assert all(one() is None for one in taken)
-        flux = take(self, block)
+        flux = take(self, block, following)
         taken.append(weakref.ref(flux))
         return flux
 

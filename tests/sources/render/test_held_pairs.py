@@ -462,6 +462,7 @@ def test_held_windows_are_knots_and_the_ends_of_courses():
         render=lambda *_, first, fit, link: (flux, None),
     )  # fmt: skip
     blocks = Blocks.__new__(Blocks)
+    blocks._next = None
     blocks._renderer = renderer
     blocks._bands = [SimpleNamespace(place=np.arange(2), sites=SimpleNamespace(size=2))]
     # compared with the last multiple of 64 ms, though the block is longer than 16 ms
