@@ -281,11 +281,16 @@ def test_lines_in_anchors_are_those_with_more_rays():
         return given(tracer, pairs, *rest, contrast_rays=contrast_rays, **more)
 
     with mock.patch.object(adaptive, "about_edges", noted):
-        for _ in source.flux_of_blocks(np.arange(20 * 14, dtype=np.uint32), source.sample_blocks(1, 0, 65_000)):
+        pixels = np.arange(20 * 14, dtype=np.uint32)
+        for _ in source.flux_of_blocks(pixels, source.sample_blocks(1, 0, 65_000)):
             pass
-    # at a weight of a ray of two wanted errors
-    assert asked.keys() == {0.0, 1.0} and asked[1.0] == {0.0, 64_000.0}
-    assert min(asked[0.0]) < 2 and max(asked[0.0]) > 64_000
+        # at a weight of a ray of two wanted errors
+        assert asked.keys() == {0.0, 1.0} and asked[1.0] == {0.0, 64_000.0}
+        assert min(asked[0.0]) < 1000 and max(asked[0.0]) > 64_000
+        # a forecast counts as many
+        asked.clear()
+        source.foresight.block(pixels, np.array([63_999.0]), np.array([64_000.0]), "events", is_anchor=True)
+        assert asked.keys() == {1.0}
 
 
 def test_rays_follow_from_what_the_decision_rays_saw():

@@ -122,7 +122,7 @@ class Foresight:
             window, place = np.nonzero(todo)
             aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
             before = self._tracer.rays_done
-            each, _ = renderer.rays_of((band.index[place], window, windows), what, todo, aims, fit)
+            each, _ = renderer.rays_of((band.index[place], window, windows), what, todo, aims, fit, is_anchor)
             rays[0] += int(each.sum(dtype=np.int64)) + self._tracer.rays_done - before
             # what linked pairs are compared with: each pixel once, by each number of rays
             linked = what.differences.linked[todo]
