@@ -154,8 +154,9 @@ def test_what_passes_before_a_lamp_of_glossy_things_comes_near():
     assert met[16:20, 22:26].all()
 
 
-@pytest.mark.parametrize("depth", [2, 3])
-def test_a_lamp_in_a_mirror_is_as_bright_as_by_paths_alone(monkeypatch, depth):
+@pytest.mark.parametrize(("depth", "sky_lux"), [(2, 0), (3, 0), (3, 80)])
+def test_a_lamp_in_a_mirror_is_as_bright_as_by_paths_alone(monkeypatch, depth, sky_lux):
+    """Below a sky as well, where paths of the card keep to directions of their own, some of which lead to the mirror."""
     mirror = {"name": "mirror", "shape": "rectangle", "size_m": [0.1, 0.3, 0], "material": {"type": "conductor"}}
     card = {"name": "card", "shape": "rectangle", "size_m": [1, 1, 0], "position_m": [0, 0, -0.1], "reflectance": 0.4}
     lamp = {
@@ -166,7 +167,8 @@ def test_a_lamp_in_a_mirror_is_as_bright_as_by_paths_alone(monkeypatch, depth):
         "size_m": [1.3, 1],
     }
     camera = {"origin_m": [0, 0, 1.5], "target_m": [0, 0, 0], "horizontal_fov_deg": 12}
-    scene = make_scene(objects=[mirror, card], light=lamp, camera=camera, max_depth=depth)
+    light = [lamp, {**D65_1000_LUX, "illuminance_lux": sky_lux}] if sky_lux else lamp
+    scene = make_scene(objects=[mirror, card], light=light, camera=camera, max_depth=depth)
     both = traced(pair_tracer(scene, mono(48, 36)), 256).mean
     monkeypatch.setattr(surfaces, "_MOST_ENTRIES", -1)
     alone = traced(pair_tracer(scene, mono(48, 36)), 256).mean

@@ -512,19 +512,28 @@ SKY = '<emitter type="constant"><spectrum name="radiance" value="0.13"/></emitte
 HAIR = "-0.2 0.2 0.02 0.008\n0.0 0.23 0.06 0.008\n0.2 0.2 0.03 0.008\n"
 
 
+SLOW_LIGHTS = [(5, False, False), (2, True, False), (5, True, False), (5, False, True)]
+
+
 @pytest.mark.parametrize(
-    "depth, lamps",
-    [(2, False), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((5, False), (2, True), (5, True)))],
+    "depth, lamps, even_sky",
+    [(2, False, False), (2, False, True), *(pytest.param(*each, marks=pytest.mark.slow) for each in SLOW_LIGHTS)],
 )
-def test_lights_without_a_closed_form_are_seen_by_paths_beside_others(tmp_path, depth, lamps):
-    """Against Mitsuba's own path tracer, with many lights of closed form and with the point light alone."""
+def test_lights_without_a_closed_form_are_seen_by_paths_beside_others(tmp_path, depth, lamps, even_sky):
+    """Against Mitsuba's own path tracer, with many lights of closed form and with the point light alone, and with a
+    uniform sky in place of the map, where paths go on in the direction of its shadow rays.
+    """
     (tmp_path / "hair.txt").write_text(HAIR)
-    text = SCENE.replace('"max_depth" value="2"', f'"max_depth" value="{depth}"').replace(SKY, "")
+    text, more = SCENE.replace('"max_depth" value="2"', f'"max_depth" value="{depth}"'), MORE
+    if even_sky:
+        more = MORE[: MORE.index('  <emitter type="envmap"')] + MORE[MORE.index('  <emitter type="spot"') :]
+    else:
+        text = text.replace(SKY, "")
     off = [] if lamps else ["lamp", "panel", "bulb"]
-    scene = loaded(tmp_path, text.replace("</scene>", MORE), unlit=off)
+    scene = loaded(tmp_path, text.replace("</scene>", more), unlit=off)
     diffuse, sensor = build(mitsuba(), scene.spec).diffuse, hr.load_sensor("gen2").crop(60, 44, 1400, 1000)
     assert list(diffuse.glows) == ["glow", "screen", "bead"] and diffuse.others == ["bead"]
-    assert diffuse.more_lights == [2, 3] and "hair" in {paint.shape for paint in diffuse.paints}
+    assert diffuse.more_lights == ([3] if even_sky else [2, 3]) and "hair" in {paint.shape for paint in diffuse.paints}
     tracer = pair_tracer(scene, sensor)
     assert tracer.has_bounced
     assert_same(tracer, scene, sensor, rays=1024, most=20)
