@@ -291,6 +291,10 @@ def test_lines_in_anchors_are_those_with_more_rays():
         asked.clear()
         source.foresight.block(pixels, np.array([63_999.0]), np.array([64_000.0]), "events", is_anchor=True)
         assert asked.keys() == {1.0}
+        # exposures are not compared with
+        asked.clear()
+        source.mean_flux(pixels, 500.0, 1500.0)
+        assert asked.keys() == {0.0}
 
 
 def test_rays_follow_from_what_the_decision_rays_saw():

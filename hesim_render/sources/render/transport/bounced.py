@@ -55,7 +55,7 @@ def bounced_flux(
     given = surface, moment, goes_on, mi.Bool(paths.bounces), (place, lobe, light)
     reflected, chosen, weight, met = paths.scatter(*given, asks, known)
     if onward is not None and not paths.sees_images:
-        # the weight of a diffuse surface is the same in all directions; cones about images of lamps change it
+        # a diffuse surface weighs all directions alike; those of cones about images of lamps save more noise
         chosen.wo = dr.select(painted, surface.to_local(onward), chosen.wo)
         chosen.pdf = dr.select(painted, dr.abs(mi.Frame3f.cos_theta(chosen.wo)) / pi, chosen.pdf)
     goes_on = goes_on & dr.any(weight != 0)
