@@ -282,12 +282,12 @@ class _BetweenKnots:
         result[:, ended[self._pair[ended] // centre.size != window]] = 0
         return result
 
-    def soon(self, centre_us: float) -> Flux:
+    def between(self, centre_us: float) -> Flux:
         """Flux at a time between the middles of the first two windows, [1, n]."""
         values, centre = self.at(0), self._knots.centre_us
         span = centre - centre[0]
         way = ((centre_us - centre[0]) / np.where(span > 0, span, np.inf)).astype(np.float32)
-        # the first knot is that of the first window, so that its number is that of the next one
+        # the first knot is the first window, so the number of both windows is that of the next knot's
         return Flux(*(values + way[self._pair] * self._change)[:, None])
 
 
@@ -318,7 +318,7 @@ class BlockFlux:
         """A single window whose middle lies between those of the first two."""
         centre, parts = np.array([centre_us]), []
         for (place, _), own in zip(self._parts, self._between, strict=True):
-            flux = own.soon(centre_us)
+            flux = own.between(centre_us)
             parts.append((place, Knots.of(flux, np.ones(flux.error.shape, np.bool_), centre)))
         return BlockFlux(self._size, parts)
 
