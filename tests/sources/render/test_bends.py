@@ -20,41 +20,75 @@ from hesim_render.sources.render.change_driven.windows import Windows
 KNOT = Path(__file__).parents[3] / "benchmarks/scenes/sky-knot.yaml"
 
 
-def one_by_one(time, flux, known, most):
-    """The same for one pixel: the line between two windows is split where a known one is furthest off."""
-    needed = {0, time.size - 1}
+def one_by_one(time, flux, known, most, until=None):
+    """The same for one pixel: from each needed window as far as a line passes all between, by trying all of them."""
+    numbers, needed = np.flatnonzero(known).tolist(), [0]
 
-    def split(first, last):
-        inner = [k for k in range(first + 1, last) if known[k]]
+    def is_straight(first, last):
         line = np.interp(time, time[[first, last]], flux[[first, last]])
-        off = {k: abs(flux[k] - line[k]) / most[k] for k in inner}
-        worst = max(off, key=off.get, default=None)
-        if worst is not None and off[worst] > 1:
-            needed.add(worst)
-            split(first, worst)
-            split(worst, last)
+        return all(abs(flux[k] - line[k]) <= most[k] for k in numbers if first < k < last)
 
-    split(0, time.size - 1)
-    return sorted(needed)
+    while needed[-1] != numbers[-1] and (until is None or needed[-1] < until):
+        needed.append(max(k for k in numbers if k > needed[-1] and is_straight(needed[-1], k)))
+    return needed + [k for k in numbers if k > needed[-1]]
 
 
-def test_a_polyline_has_the_windows_that_are_furthest_off():
+class Seen:
+    """Looks at given fluxes [window, pixel], which remember what was looked at."""
+
+    def __init__(self, flux):
+        self.flux, self.asked = flux, []
+
+    def __call__(self, window, pixel):
+        self.asked += zip(pixel.tolist(), window.tolist(), strict=True)
+        return self.flux[window, pixel]
+
+
+def random_courses():
     rng = np.random.default_rng(3)
     time = np.cumsum(rng.uniform(20, 300, 40))
     flux = np.cumsum(rng.normal(0, 40, (40, 60)), axis=0).astype(np.float32) + 900
-    most = rng.uniform(30, 150, (40, 60)) * np.linspace(0.5, 6, 60).astype(np.float32)
-    known = rng.random((40, 60)) < 0.4
+    most = rng.uniform(30, 150, (40, 60)) * np.linspace(0.5, 6, 60)
+    known = rng.random((40, 60)) < 0.6
     known[[0, -1]] = True
-    needed = polyline(flux, known, time, most)
+    return time, flux, known, most.astype(np.float32)
+
+
+def test_a_polyline_goes_as_far_as_a_line_passes_all_between():
+    time, flux, known, most = random_courses()
+    look = Seen(flux)
+    needed = polyline(look, known, time, most, 39)
     sizes = set()
     for pixel in range(60):
         expected = one_by_one(time, *(values[:, pixel] for values in (flux, known, most)))
         assert np.flatnonzero(needed[:, pixel]).tolist() == expected
         sizes.add(len(expected))
-    assert min(sizes) == 2 and max(sizes) > 6
-    # a window exactly at its bound is on the line
+    assert min(sizes) < 4 and max(sizes) > 7
+    # each window that can be looked at is, once
+    assert sorted(look.asked) == [tuple(pair) for pair in np.argwhere(known.T).tolist()]
+    # a window exactly at its bound is on the line, and a window just beyond it is not
     flat, bound = np.array([[8.0], [8.5], [8.0]], np.float32), np.full((3, 1), 0.5, np.float32)
-    assert polyline(flat, np.ones((3, 1), np.bool_), time[:3], bound)[:, 0].tolist() == [True, False, True]
+    every = np.ones((3, 1), np.bool_)
+    assert polyline(Seen(flat), every, np.array([3.0, 5, 7]), bound, 2)[:, 0].tolist() == [True, False, True]
+    assert polyline(Seen(flat), every, np.array([3.0, 5, 7]), bound - 0.01, 2).all()
+
+
+def test_nothing_is_looked_at_that_no_value_of_the_run_needs():
+    time, flux, known, most = random_courses()
+    whole = polyline(Seen(flux), known, time, most, 39)
+    few = 0
+    for until in (5, 13, 30):
+        look = Seen(flux)
+        needed = polyline(look, known, time, most, until)
+        behind = [max((w for p, w in look.asked if p == pixel), default=0) for pixel in range(60)]
+        for pixel in range(60):
+            expected = one_by_one(time, *(values[:, pixel] for values in (flux, known, most)), until)
+            assert np.flatnonzero(needed[:, pixel]).tolist() == expected
+            # the same as for a longer run, up to the first needed window from the end on
+            first = np.flatnonzero(whole[:, pixel])[np.searchsorted(np.flatnonzero(whole[:, pixel]), until)]
+            assert np.array_equal(needed[: first + 1, pixel], whole[: first + 1, pixel])
+        few += sum(window < 39 for window in behind)
+    assert few > 30
 
 
 def plan_of(count, pixels):
@@ -93,7 +127,9 @@ def test_what_is_left_out_and_what_is_not():
     what.differences.rays[3, 1] = 64
     what.barred[4, 1] = True
     what.rendered[7, :2] = False
-    what.fitted[2, 0] = what.fitted[5, 0] = what.asked[6, 0] = what.asked[5, 2] = True
+    what.fitted[2, 0] = what.fitted[5, 0] = what.asked[6, 0] = what.asked[5, 2] = what.fitted[2, 3] = what.asked[
+        4, 3
+    ] = True
     # seven windows of 6144 rays together are not worth three times nine looks of 256; two of 4096 are worth four
     what.rays[:, 3] = 1024
     what.rays[1:3, 3] = 512
@@ -101,7 +137,8 @@ def test_what_is_left_out_and_what_is_not():
     new = straightened(tracer, np.arange(7, 13, dtype=np.uint32), windows, what, TUNING)
     rows = [np.flatnonzero(new.rendered[:, pixel]).tolist() for pixel in range(pixels)]
     assert rows == [[0, 5, 8], [0, 3, 4, 5, 8], [0, 5, 8], list(range(9)), [0, 5, 8], [0, 8]]
-    assert not new.fitted[2, 0] and new.fitted[5, 0] and not new.asked[6, 0] and new.asked[5, 2]
+    # pixels that were looked at are not followed by lines as well
+    assert np.argwhere(new.fitted).tolist() == [[2, 3]] and np.argwhere(new.asked).tolist() == [[4, 3]]
     looked = {pixel: sorted(window for window, other in tracer.asked if other == 7 + pixel) for pixel in range(pixels)}
     assert looked[0] == [0, 1, 2, 3, 4, 5, 6, 8] and looked[1] == [0, 1, 2, 5, 6, 8]
     assert looked[3] == [] and looked[4] == [0, 1, 5, 8]
@@ -124,8 +161,11 @@ def values_of(seconds, cols, rows, tuning=TUNING):
 @pytest.mark.slow
 def test_no_value_depends_on_the_end_of_the_run_and_a_third_of_the_rays_is_saved():
     source, _, flux = values_of(0.012, 7, 5)
-    _, _, short = values_of(0.007, 7, 5)
-    np.testing.assert_array_equal(short, flux[: len(short)])
+    for seconds in (0.007, 0.002):
+        early, _, short = values_of(seconds, 7, 5)
+        np.testing.assert_array_equal(short, flux[: len(short)])
+    # few looks lie behind the end: 0.79 with all of the block
+    assert early.counts.rays < 0.75 * source.counts.rays
     every, _, _ = values_of(0.012, 7, 5, replace(TUNING, bend_gain=1e9))
     assert source.counts.rays < 0.7 * every.counts.rays
     # looks count as rays of the picture
@@ -167,9 +207,7 @@ def test_the_estimate_of_a_block_knows_of_bends_and_that_of_a_window_does_not(mo
     (block, *_) = (b for b in source.sample_blocks(1, 0.0, 12_000.0) if b.wanted.size > 2)
     rays = source.foresight.block(pixel, block.begin_us, block.end_us, "events").rays[0]
     asked = []
-    monkeypatch.setattr(
-        adaptive, "straightened", lambda tracer, index, windows, what, tuning, among: (asked.append(1), what)[1]
-    )
+    monkeypatch.setattr(adaptive, "straightened", lambda tracer, index, windows, what, *_: (asked.append(1), what)[1])
     assert rays < 0.7 * source.foresight.block(pixel, block.begin_us, block.end_us, "events").rays[0] and asked
     asked.clear()
     source.foresight.block(pixel, block.begin_us[:1], block.end_us[:1], "events")

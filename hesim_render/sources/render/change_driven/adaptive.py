@@ -173,10 +173,17 @@ class AdaptiveRenderer:
         return self.tuning.lone_footprint_px if band.apart else self.tuning.footprint_px
 
     def plan(
-        self, pilot: Pilot, band: Band, is_knot: bool, windows: Windows | None = None, shares: Shares = None
+        self,
+        pilot: Pilot,
+        band: Band,
+        is_knot: bool,
+        windows: Windows | None = None,
+        shares: Shares = None,
+        until: int | None = None,
     ) -> Plan:
         """Which pairs of a band are rendered, with how many rays; see `plan`. Of the windows of a block, those between
-        which the light of paths is a straight line are left out; this traces rays.
+        which the light of paths is a straight line are left out; this traces rays. With `until`, the plan holds up to
+        this window, see `Plan.until`.
         """
         given = pilot, band.sites, band.unit, band.quality, self.gain, self.tuning
         # windows of synchronous sensors are too far apart for an edge to stay within a pixel
@@ -188,9 +195,9 @@ class AdaptiveRenderer:
         if windows is not None and not (self.tracer.is_diffuse or self.has_ticks):
             before = self.tracer.rays_done
             among = None if what.bounces is None else np.flatnonzero(what.bounces.any(axis=0))
-            what = straightened(self.tracer, band.index, windows, what, self.tuning, among)
+            what = straightened(self.tracer, band.index, windows, what, self.tuning, among, until)
             self.counts.rays += self.tracer.rays_done - before
-        return what
+        return what if until is None else what.until(until)
 
     def follow(
         self, band: Band, windows: Windows, numbers: NDArray[np.int64], what: Plan

@@ -6,6 +6,7 @@ would take many rays, each is therefore looked at with a part of these, and of t
 polyline through them needs.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +20,8 @@ from hesim_render.sources.render.change_driven.windows import Windows
 
 #: Repetition of these rays in the stream of decision rays, of which lines have 0 to 2.
 _REPEAT = 3
+#: Looks of a pixel that are traced at a time, once those up to the end of the run are known.
+_AHEAD = 4
 
 
 def straightened(
@@ -28,6 +31,7 @@ def straightened(
     what: Plan,
     tuning: Tuning,
     among: NDArray[np.int64] | None = None,
+    until: int | None = None,
 ) -> Plan:
     """A plan without the windows between which the flux of a pixel is a straight line.
 
@@ -39,6 +43,8 @@ def straightened(
     what : plan of a whole block, so that no value depends on the end of a run.
     tuning : constants.
     among : places of the pixels that are looked at; None for all.
+    until : last window that is asked for, see `Plan.until`; None for the last one. What is rendered behind the first
+        window that a pixel needs from there on is unknown.
     """
     last = what.rendered.shape[0] - 1
     # windows that are rendered by themselves, and may be left out: neither ends of the block nor small objects
@@ -53,53 +59,90 @@ def straightened(
         return what
     looks = marked[:, place]
     looks[[0, last]] = True
-    window, column = np.nonzero(looks)
-    pixel = place[column]
-    seen = tracer.pilot(*(index[pixel], window, windows, tuning.bend_rays, 1.0, Stream.RENDER_EDGE), repeat=_REPEAT)
-    flux = np.zeros(looks.shape, np.float32)
-    flux[window, column] = np.where(what.controlled[window, pixel], seen.controlled, seen.plain)
+
+    def look(window: NDArray[np.int64], column: NDArray[np.int64]) -> NDArray[np.float32]:
+        pixel = place[column]
+        of = index[pixel], window, windows, tuning.bend_rays, 1.0, Stream.RENDER_EDGE
+        seen = tracer.pilot(*of, repeat=_REPEAT)
+        return np.where(what.controlled[window, pixel], seen.controlled, seen.plain)
+
     centre_us = 0.5 * (windows.begin_us + windows.end_us)
-    needed = polyline(flux, looks, centre_us, np.float32(tuning.bend) * what.wanted[:, place])
-    window, column = np.nonzero(looks & ~needed)
+    most = np.float32(tuning.bend) * what.wanted[:, place]
+    window, column = np.nonzero(looks & ~polyline(look, looks, centre_us, most, last if until is None else until))
     what = what.without(window, place[column])
-    return replace(what, fitted=what.fitted & what.rendered, asked=what.asked & what.rendered)
+    # the looks know better than lines what may be left out, and a line would have to be looked for behind the end
+    followed = np.ones(index.size, np.bool_)
+    followed[place] = False
+    return replace(what, fitted=what.fitted & followed, asked=what.asked & followed)
 
 
 def polyline(
-    flux: NDArray[np.float32], known: NDArray[np.bool_], time_us: NDArray[np.float64], most: NDArray[np.float32]
+    look: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float32]],
+    known: NDArray[np.bool_],
+    time_us: NDArray[np.float64],
+    most: NDArray[np.float32],
+    until: int,
 ) -> NDArray[np.bool_]:
-    """Known windows that a line from one to the next needs, so that no other is further from it than its bound.
+    """Windows that a line from one to the next needs, so that no other that can be looked at is further from it than
+    its bound.
 
-    The first and the last window are needed. Of those between, the one that is furthest off is added, for each stretch
-    by itself, until none is off [douglas1973].
+    From one needed window to the next goes the longest line of that kind, by the cone of slopes that pass all windows
+    between [williams1978]. What is needed up to a window therefore follows from looks a little beyond it: those behind
+    are not taken.
 
     Parameters
     ----------
-    flux : [window, n], e⁻/s.
-    known : [window, n], the first and the last window are.
+    look : gives the flux in windows [k] of pixels [k], e⁻/s.
+    known : [window, n], windows that can be looked at; the first and the last one are among them.
     time_us : [window], µs.
     most : [window, n], largest distance from the line, e⁻/s.
+    until : behind the first needed window from this one on, all known windows count as needed.
 
     Returns
     -------
     The needed windows, [window, n].
     """
-    count = flux.shape[0]
-    needed = np.zeros(known.shape, np.bool_)
-    needed[[0, -1]] = True
-    every = np.arange(count)[:, None]
-    while True:
-        # needed windows before and after each one
-        before = np.maximum.accumulate(np.where(needed, every, 0), axis=0)
-        after = np.minimum.accumulate(np.where(needed, every, count - 1)[::-1], axis=0)[::-1]
-        begin, end = time_us[before], time_us[after]
-        low, high = (np.take_along_axis(flux, number, axis=0) for number in (before, after))
-        part = (time_us[:, None] - begin) / np.where(end > begin, end - begin, 1)
-        off = np.where(known & ~needed, np.abs(flux - (low + part * (high - low))) / most, 0)
-        # of each stretch the window that is furthest off; stretches of a pixel are named by their first window
-        worst = np.zeros(flux.shape)
-        np.maximum.at(worst, (before, np.broadcast_to(np.arange(flux.shape[1]), before.shape)), off)
-        add = (off > 1) & (off == np.take_along_axis(worst, before, axis=0))
-        if not add.any():
-            return needed
-        needed |= add
+    pixels = known.shape[1]
+    count = np.count_nonzero(known, axis=0)
+    # the windows of each pixel in order of time, [number, n]; filled up with the last one
+    window = np.sort(np.where(known, np.arange(known.shape[0])[:, None], known.shape[0] - 1), axis=0)[: count.max()]
+    times = time_us[window]
+    flux, bound = np.zeros(window.shape), np.take_along_axis(most, window, axis=0).astype(np.float64)
+    # numbers: of the looks that were taken, of the last needed window, of the furthest one that a line from there
+    # reaches, and of the next one to be tried
+    taken, begin, furthest, trying = np.zeros((4, pixels), np.int64)
+    trying += 1
+    # slopes of the lines from there that pass all windows between
+    least, largest = np.full(pixels, -np.inf), np.full(pixels, np.inf)
+    needed, active = known.copy(), np.arange(pixels)
+    # all that come before the end, and a few behind it
+    wanted = np.count_nonzero(known[: until + 1], axis=0) + _AHEAD
+    while active.size:
+        short = active[trying[active] >= taken[active]]
+        if short.size:
+            upto = np.minimum(np.maximum(wanted[short], taken[short] + _AHEAD), count[short])
+            number = np.arange(window.shape[0])[:, None]
+            row, col = np.nonzero((number >= taken[short]) & (number < upto))
+            flux[row, short[col]] = look(window[row, short[col]], short[col])
+            taken[short] = upto
+        start, now = begin[active], trying[active]
+        span = times[now, active] - times[start, active]
+        rise, room = flux[now, active] - flux[start, active], bound[now, active]
+        slope = rise / span
+        reaches = (least[active] <= slope) & (slope <= largest[active])
+        furthest[active[reaches]] = now[reaches]
+        least[active] = np.maximum(least[active], (rise - room) / span)
+        largest[active] = np.minimum(largest[active], (rise + room) / span)
+        trying[active] += 1
+        # no line goes further, or no window is left
+        ends = active[(least[active] > largest[active]) | (trying[active] == count[active])]
+        # windows between two needed ones are not needed
+        between = np.arange(window.shape[0])[:, None]
+        row, col = np.nonzero((between > begin[ends]) & (between < furthest[ends]))
+        needed[window[row, ends[col]], ends[col]] = False
+        begin[ends], trying[ends] = furthest[ends], furthest[ends] + 1
+        least[ends], largest[ends] = -np.inf, np.inf
+        is_done = np.zeros(pixels, np.bool_)
+        is_done[ends] = (furthest[ends] == count[ends] - 1) | (window[furthest[ends], ends] >= until)
+        active = active[~is_done[active]]
+    return needed

@@ -180,8 +180,8 @@ class Blocks:
         shares = None
         if anchor.shares is not None and ending.shares is not None:
             shares = anchor.shares, ending.shares
-        what = renderer.plan(pilot, band, is_knot=True, windows=windows, shares=shares)
-        return what.until(int(np.flatnonzero(block.wanted)[-1]))
+        until = int(np.flatnonzero(block.wanted)[-1])
+        return renderer.plan(pilot, band, is_knot=True, windows=windows, shares=shares, until=until)
 
 
 def is_between(block: Block, following: Block) -> bool:

@@ -106,10 +106,9 @@ class Foresight:
             before, fit = self._tracer.rays_done, None
             block = windows if role == "events" and windows.size > 1 else None
             shares = None if anchor is None or anchor.shares is None else (anchor.shares, anchor.shares)
-            what = renderer.plan(pilot, band, is_knot=role == "events", windows=block, shares=shares)
+            what = renderer.plan(pilot, band, is_knot=role == "events", windows=block, shares=shares, until=until)
             if is_anchor:
                 what = renderer.sharing.planned(what, band, renderer.counts)
-            what = what.until(windows.size - 1 if until is None else until)
             if windows.size > 1:
                 what, fit, *_ = renderer.follow(band, windows, numbers[:, : band.place.size], what)
             rays[0] += self._tracer.rays_done - before
