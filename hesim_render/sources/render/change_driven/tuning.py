@@ -200,7 +200,7 @@ class Tuning:
     low_contrast: float = 16.0
     flat_part: float = 1 / 8
     bend_rays: int = 256
-    bend_gain: float = 3.0
+    bend_gain: float = 1.5
     bend: float = 2.1
     least_difference_rays: int = 64
     difference_gain: float = 4.0
