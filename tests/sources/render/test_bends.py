@@ -130,9 +130,9 @@ def test_what_is_left_out_and_what_is_not():
     what.fitted[2, 0] = what.fitted[5, 0] = what.asked[6, 0] = what.asked[5, 2] = what.fitted[2, 3] = what.asked[
         4, 3
     ] = True
-    # seven windows of 6144 rays together are not worth three times nine looks of 256; two of 4096 are worth four
-    what.rays[:, 3] = 1024
-    what.rays[1:3, 3] = 512
+    # seven windows of 3072 rays together are not worth 1.5 times nine looks of 256; two of 4096 are worth four
+    what.rays[:, 3] = 512
+    what.rays[1:3, 3] = 256
     what.rendered[2:5, 4] = what.rendered[6:8, 4] = False
     new = straightened(tracer, np.arange(7, 13, dtype=np.uint32), windows, what, TUNING)
     rows = [np.flatnonzero(new.rendered[:, pixel]).tolist() for pixel in range(pixels)]

@@ -455,10 +455,9 @@ def test_held_windows_are_knots_and_the_ends_of_courses():
     of_edge = Courses(*(np.array(each) for each in ([4, 5], [0, 0], [3, 3], [6, 6])), model)
     held = HeldPairs(*(np.array(each) for each in ([3, 4], [0, 1], [1, 2])))
     what = SimpleNamespace(rendered=rendered)
-    what.until = lambda window: what
     renderer = SimpleNamespace(
         has_ticks=False, look_stride=4, pilot=lambda *_, ending: (None, None),
-        plan=lambda *_, is_knot, windows, shares: what, follow=lambda *_: (what, None, of_edge, held),
+        plan=lambda *_, is_knot, windows, shares, until: what, follow=lambda *_: (what, None, of_edge, held),
         render=lambda *_, first, fit, link: (flux, None),
     )  # fmt: skip
     blocks = Blocks.__new__(Blocks)
