@@ -123,8 +123,8 @@ class Tuning:
     bend_rays : rays, F. From `room` and `floor-ball` of `benchmarks/scenes` alone: rays in each window that the pilot
         marked, of pixels that see paths, which say where the flux bends. Half as many: as many windows are rendered.
         Larger (512): they cost more than they save.
-    bend_gain : factor, C. They look where the marked windows take this many times as many rays. Without (0): cheap
-        windows are looked at for as much as rendering them takes.
+    bend_gain : factor, F. From the same scenes, judged on `sky-knot` there: they look where the marked windows take
+        this many times as many rays. Without (0): cheap windows are looked at for as much as rendering them takes.
     bend : wanted errors, F. From the same scenes: largest distance of such a window from the line between others.
         Larger (3): changes are off by more. Without (0): every window is rendered.
     least_difference_rays : rays, C. Least number of rays of a difference. Without: no pilot ray sees a change, and few
