@@ -63,7 +63,7 @@ def test_a_polyline_goes_as_far_as_a_line_passes_all_between():
         expected = one_by_one(time, *(values[:, pixel] for values in (flux, known, most)))
         assert np.flatnonzero(needed[:, pixel]).tolist() == expected
         sizes.add(len(expected))
-    assert min(sizes) < 4 and max(sizes) > 7
+    assert min(sizes) == 2 and max(sizes) > 7
     # each window that can be looked at is, once
     assert sorted(look.asked) == [tuple(pair) for pair in np.argwhere(known.T).tolist()]
     # a window exactly at its bound is on the line, and a window just beyond it is not
@@ -127,9 +127,7 @@ def test_what_is_left_out_and_what_is_not():
     what.differences.rays[3, 1] = 64
     what.barred[4, 1] = True
     what.rendered[7, :2] = False
-    what.fitted[2, 0] = what.fitted[5, 0] = what.asked[6, 0] = what.asked[5, 2] = what.fitted[2, 3] = what.asked[
-        4, 3
-    ] = True
+    what.fitted[[2, 5, 2], [0, 0, 3]] = what.asked[[6, 5, 4], [0, 2, 3]] = True
     # seven windows of 3072 rays together are not worth 1.5 times nine looks of 256; two of 4096 are worth four
     what.rays[:, 3] = 512
     what.rays[1:3, 3] = 256
@@ -146,6 +144,26 @@ def test_what_is_left_out_and_what_is_not():
     what.rendered[1:-1] = False
     what.rendered[5] = True
     assert np.all(straightened(tracer, np.arange(7, 13, dtype=np.uint32), windows, what, TUNING).rendered[5])
+
+
+def test_a_plan_knows_the_end_of_the_run(monkeypatch):
+    """Thirty windows between which the flux goes up and down by 70, of which the run asks for the first four: two looks
+    behind these tell that the fourth is needed.
+    """
+    count, flux = 30, np.tile([[530.0], [460.0]], (15, 2)).astype(np.float32)
+    ends = 70.0 * np.arange(2, count + 2)
+    windows, tracer = Windows(ends - 3, ends), Looks(flux, flux)
+    tracer.is_diffuse, tracer.rays_done, tracer.rays = False, 40, SimpleNamespace(is_box=True)
+    monkeypatch.setattr(adaptive, "plan", lambda *_: plan_of(count, 2))
+    own = SimpleNamespace(
+        tracer=tracer, has_ticks=False, look_stride=16, tuning=TUNING, gain=None, counts=SimpleNamespace(rays=9)
+    )
+    band = SimpleNamespace(sites=None, unit=None, quality=0.5, index=np.array([7, 8], np.uint32))
+    short = adaptive.AdaptiveRenderer.plan(own, None, band, True, windows, until=3)
+    assert max(window for window, _ in tracer.asked) == 3 + 4
+    assert np.flatnonzero(short.rendered[:, 1]).tolist() == [0, 1, 2, 3]
+    whole = adaptive.AdaptiveRenderer.plan(own, None, band, True, windows)
+    assert max(window for window, _ in tracer.asked) == count - 1 and whole.rendered.all()
 
 
 def values_of(seconds, cols, rows, tuning=TUNING):

@@ -182,8 +182,8 @@ class AdaptiveRenderer:
         until: int | None = None,
     ) -> Plan:
         """Which pairs of a band are rendered, with how many rays; see `plan`. Of the windows of a block, those between
-        which the light of paths is a straight line are left out; this traces rays. With `until`, the plan holds up to
-        this window, see `Plan.until`.
+        which the light of paths is a straight line are left out; this traces rays. With `until`, pairs on which no
+        value up to this window depends are left out as well, see `Plan.until`.
         """
         given = pilot, band.sites, band.unit, band.quality, self.gain, self.tuning
         # windows of synchronous sensors are too far apart for an edge to stay within a pixel

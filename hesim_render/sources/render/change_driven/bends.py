@@ -70,7 +70,7 @@ def straightened(
     most = np.float32(tuning.bend) * what.wanted[:, place]
     window, column = np.nonzero(looks & ~polyline(look, looks, centre_us, most, last if until is None else until))
     what = what.without(window, place[column])
-    # the looks know better than lines what may be left out, and a line would have to be looked for behind the end
+    # their looks say which windows may be left out; following edges would need fits behind the end of the run as well
     followed = np.ones(index.size, np.bool_)
     followed[place] = False
     return replace(what, fitted=what.fitted & followed, asked=what.asked & followed)
@@ -102,47 +102,46 @@ def polyline(
     -------
     The needed windows, [window, n].
     """
-    pixels = known.shape[1]
-    count = np.count_nonzero(known, axis=0)
+    pixels, count = known.shape[1], np.count_nonzero(known, axis=0)
     # the windows of each pixel in order of time, [number, n]; filled up with the last one
     window = np.sort(np.where(known, np.arange(known.shape[0])[:, None], known.shape[0] - 1), axis=0)[: count.max()]
-    times = time_us[window]
+    number, times = np.arange(window.shape[0])[:, None], time_us[window]
     flux, bound = np.zeros(window.shape), np.take_along_axis(most, window, axis=0).astype(np.float64)
-    # numbers: of the looks that were taken, of the last needed window, of the furthest one that a line from there
+    # numbers [n]: of looks that were taken, of the last needed window, of the furthest one that a line from there
     # reaches, and of the next one to be tried
     taken, begin, furthest, trying = np.zeros((4, pixels), np.int64)
     trying += 1
     # slopes of the lines from there that pass all windows between
     least, largest = np.full(pixels, -np.inf), np.full(pixels, np.inf)
     needed, active = known.copy(), np.arange(pixels)
-    # all that come before the end, and a few behind it
-    wanted = np.count_nonzero(known[: until + 1], axis=0) + _AHEAD
+    # the first looks: all up to the end, and a few behind it
+    at_first = np.count_nonzero(known[: until + 1], axis=0) + _AHEAD
     while active.size:
+        # more looks, where the next window has none yet
         short = active[trying[active] >= taken[active]]
         if short.size:
-            upto = np.minimum(np.maximum(wanted[short], taken[short] + _AHEAD), count[short])
-            number = np.arange(window.shape[0])[:, None]
+            upto = np.minimum(np.maximum(at_first[short], taken[short] + _AHEAD), count[short])
             row, col = np.nonzero((number >= taken[short]) & (number < upto))
             flux[row, short[col]] = look(window[row, short[col]], short[col])
             taken[short] = upto
+        # the line to the next window passes all between if its slope is one of those that do
         start, now = begin[active], trying[active]
         span = times[now, active] - times[start, active]
         rise, room = flux[now, active] - flux[start, active], bound[now, active]
         slope = rise / span
         reaches = (least[active] <= slope) & (slope <= largest[active])
         furthest[active[reaches]] = now[reaches]
+        # of these, fewer pass that window as well
         least[active] = np.maximum(least[active], (rise - room) / span)
         largest[active] = np.minimum(largest[active], (rise + room) / span)
         trying[active] += 1
-        # no line goes further, or no window is left
+        # no line goes further, or no window is left: the furthest one is needed, and none before it
         ends = active[(least[active] > largest[active]) | (trying[active] == count[active])]
-        # windows between two needed ones are not needed
-        between = np.arange(window.shape[0])[:, None]
-        row, col = np.nonzero((between > begin[ends]) & (between < furthest[ends]))
+        row, col = np.nonzero((number > begin[ends]) & (number < furthest[ends]))
         needed[window[row, ends[col]], ends[col]] = False
+        # the next line begins there
         begin[ends], trying[ends] = furthest[ends], furthest[ends] + 1
         least[ends], largest[ends] = -np.inf, np.inf
-        is_done = np.zeros(pixels, np.bool_)
-        is_done[ends] = (furthest[ends] == count[ends] - 1) | (window[furthest[ends], ends] >= until)
-        active = active[~is_done[active]]
+        is_done = (furthest[ends] == count[ends] - 1) | (window[furthest[ends], ends] >= until)
+        active = np.setdiff1d(active, ends[is_done], assume_unique=True)
     return needed

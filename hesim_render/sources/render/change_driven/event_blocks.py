@@ -287,7 +287,7 @@ class _BetweenKnots:
         values, centre = self.at(0), self._knots.centre_us
         span = centre - centre[0]
         way = ((centre_us - centre[0]) / np.where(span > 0, span, np.inf)).astype(np.float32)
-        # the first knot is the first window, so the number of both windows is that of the next knot's
+        # the first knot is window 0, so `_pair` is the number of the window of the next knot
         return Flux(*(values + way[self._pair] * self._change)[:, None])
 
 
