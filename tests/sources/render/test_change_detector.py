@@ -18,9 +18,10 @@ from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.change_detector import windows_with_changes
 from hesim_render.sources.render.change_driven.error_target import Noise
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.kept_pilots import Anchored
 from hesim_render.sources.render.change_driven.neighbours import Lattice, Sites
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux, PilotRays
-from hesim_render.sources.render.change_driven.pilot import Anchored, take_pilot
+from hesim_render.sources.render.change_driven.pilot import take_pilot
 from hesim_render.sources.render.change_driven.windows import Windows
 
 #: Wanted error, e⁻/s; a pixel is even up to six times this scatter, and more than it is a change.

@@ -18,10 +18,11 @@ from hesim_render.sources.render.change_driven.anchor import anchor_us, period_u
 from hesim_render.sources.render.change_driven.differences import difference_of, differences
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.held_pairs import HeldPairs
+from hesim_render.sources.render.change_driven.kept_pilots import Anchored
 from hesim_render.sources.render.change_driven.neighbours import Lattice, Sites
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, PilotRays, not_negative
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
-from hesim_render.sources.render.change_driven.pilot import Anchored, Change, Pilot, Refinement, take_pilot
+from hesim_render.sources.render.change_driven.pilot import Change, Pilot, Refinement, take_pilot
 from hesim_render.sources.render.change_driven.tuning import TUNING
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.exact import used_responses

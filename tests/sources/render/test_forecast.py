@@ -42,7 +42,7 @@ class Counted:
     5 of the flux there, 30 of pilots; 64 and 32 in the first anchor. Seven traces a block. It looks ahead by itself.
     """
 
-    is_static, has_ticks, sees_paths, seed, sensor = False, True, True, 3, None
+    is_static, has_ticks, sees_paths, seed, sensor, kept_rays = False, True, True, 3, None, 0
 
     def __init__(self, constant):
         self.constant, self.foresight = constant, self
@@ -82,6 +82,8 @@ def test_the_first_pilot_goes_on_where_nearly_all_pixels_may_change(constant, sa
     seconds = 3e-6 * (800 * each - looks) + 2e-6 * looks + 33e-9 * 800 * each + 0.04 * 7 * len(blocks)
     assert estimate.seconds == pytest.approx(seconds)
     assert estimate.ray_s == pytest.approx(3.033e-6) and estimate.trace_s == 0.04
+    source.kept_rays = 32
+    assert forecast.forecast(source, demand).peak_bytes == estimate.peak_bytes + 800 * 32 * 10
     many = replace(demand, event_pixel=np.arange(3 << 17, dtype=np.uint32))
     assert forecast.forecast(source, many).seconds > 0.04 * 7 * len(blocks) * 2 + 3e-6 * 64 * (3 << 17)
 

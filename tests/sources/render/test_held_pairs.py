@@ -456,7 +456,8 @@ def test_held_windows_are_knots_and_the_ends_of_courses():
     held = HeldPairs(*(np.array(each) for each in ([3, 4], [0, 1], [1, 2])))
     what = SimpleNamespace(rendered=rendered)
     renderer = SimpleNamespace(
-        has_ticks=False, look_stride=4, pilot=lambda *_, ending: (None, None),
+        has_ticks=False, look_stride=4, kept_rays=0,
+        pilot=lambda *_, ending, begun, is_kept: (SimpleNamespace(ended=None), None),
         plan=lambda *_, is_knot, windows, shares, until: what, follow=lambda *_: (what, None, of_edge, held),
         render=lambda *_, first, fit, link: (flux, None),
     )  # fmt: skip
@@ -468,7 +469,7 @@ def test_held_windows_are_knots_and_the_ends_of_courses():
     span_us = 191_994.0, 192_000.0
     anchor = SimpleNamespace(span_us=span_us, pilot=None, shares=None, render=lambda *_: None, link=lambda *_: None)
     blocks._anchors = [anchor]
-    blocks._time, blocks._last = (centre[0] - 3, centre[0] + 3), Flux.zeros(1, 2)
+    blocks._time, blocks._last, blocks._ended = (centre[0] - 3, centre[0] + 3), Flux.zeros(1, 2), [None]
     got = blocks.take(block)
     for number, values in enumerate(before.arrays):
         ends = values[1, 0] + (centre - centre[3]) / (centre[6] - centre[3]) * (values[6, 0] - values[1, 0])

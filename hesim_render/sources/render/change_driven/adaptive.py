@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,10 @@ from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Band, Counts, Flux, Still
 from hesim_render.sources.render.change_driven.held_pairs import HeldPairs, held_pairs
+from hesim_render.sources.render.change_driven.kept_pilots import Anchored, Ended
 from hesim_render.sources.render.change_driven.neighbours import Sites, squares
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux
-from hesim_render.sources.render.change_driven.pilot import Anchored, Pilot, take_pilot
+from hesim_render.sources.render.change_driven.pilot import Pilot, knows_rest, take_pilot
 from hesim_render.sources.render.change_driven.plan import Plan, Shares, plan
 from hesim_render.sources.render.change_driven.sample_instants import MotionClock
 from hesim_render.sources.render.change_driven.shared_tracer import SharedTracer
@@ -33,6 +35,8 @@ _ALWAYS_US = (-np.inf, np.inf)
 Link = Callable[[Plan, NDArray, NDArray, PairEdges | None, PairFlux], NDArray[np.float32]]
 #: Part of the wanted error below which a flux counts as no light at all.
 _NOTHING = np.float32(1e-3)
+#: Largest number of pilot rays that are kept from the end of a block for the next one, in 0.27 GB.
+_MOST_KEPT_RAYS = 1 << 25
 
 
 def pixels_at_once(role: Role, has_ticks: bool, apart: bool) -> int:
@@ -99,16 +103,28 @@ class AdaptiveRenderer:
             self._kept[role] = Still(_ALWAYS_US if may_rest else None, self.index.size)
         return self._kept[role]
 
+    @cached_property
+    def kept_rays(self) -> int:
+        """Pilot rays of an event pixel that a block keeps for the next one: none where they tell what comes near, or of
+        too many pixels.
+        """
+        rays = 0 if knows_rest(self.tracer) else self._pilot_rays("events")
+        return rays if rays * self._sensor.layout.evs_pixel.size <= _MOST_KEPT_RAYS else 0
+
+    def _pilot_rays(self, role: Role) -> int:
+        if role == "any":
+            return self.tuning.frame_pilot_rays
+        return self.tuning.lone_pilot_rays if self.noise.is_apart(role) else self.tuning.pilot_rays
+
     def bands(self, pixel: NDArray[np.uint32], role: Role) -> Iterator[Band]:
         """The listed pixels in bands, each of which is about square."""
         index, lattice = self.index[pixel], self.noise.lattice(role)
-        apart, tuning = self.noise.is_apart(role), self.tuning
-        rays = tuning.lone_pilot_rays if apart else tuning.pilot_rays
+        apart, tuning, rays = self.noise.is_apart(role), self.tuning, self._pilot_rays(role)
         # where edges or texels cross a pixel within a window, strata gain less; a pilot in a wide area sees more than
         # its pixel
         quality, mild = self.quality, self.tracer.is_plain and (apart or not self.has_ticks)
         if role == "any":
-            rays, quality, mild = tuning.frame_pilot_rays, quality / tuning.frame_margin, False
+            quality, mild = quality / tuning.frame_margin, False
         at_once = pixels_at_once(role, self.has_ticks, apart)
         for place in squares(*np.divmod(index, self._sensor.spec.geometry.cols), at_once):
             # a single window is not followed through time, and needs no pixels beside those that lie apart
@@ -129,6 +145,8 @@ class AdaptiveRenderer:
         stride: int = 1,
         known: PilotFlux | None = None,
         ending: Anchored | None = None,
+        begun: Ended | None = None,
+        is_kept: bool = False,
     ) -> tuple[Pilot, NDArray[np.bool_]]:
         """Pilot pass of a band in listed windows; see `take_pilot`."""
         before, cols = self.tracer.rays_done, self._sensor.spec.geometry.cols
@@ -146,7 +164,8 @@ class AdaptiveRenderer:
         steps, few = len(numbers) - 1, 1
         if self.has_ticks and steps > 1:
             few = self._clock.windows_of_a_pixel(*windows.span_us, steps)
-        pilot, near = take_pilot(*of, span_us, looks, anchored, known, stride, wanted, band.mild, few, ending)
+        given = *of, span_us, looks, anchored, known, stride, wanted, band.mild, few, ending, begun, is_kept
+        pilot, near = take_pilot(*given)
         if band.apart and pilot.windows > 2:
             # no neighbour tells when deep shadow ends
             seen = pilot.steady_flux, pilot.unshadowed

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.edges import PairEdges
 from hesim_render.sources.render.change_driven.estimates import Band, Flux
+from hesim_render.sources.render.change_driven.kept_pilots import Anchored
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, not_negative
-from hesim_render.sources.render.change_driven.pilot import Anchored
 from hesim_render.sources.render.change_driven.plan import Plan
 from hesim_render.sources.render.change_driven.windows import Windows
 

@@ -18,7 +18,8 @@ from hesim_render.core.device import dr
 from hesim_render.mosaic.schedule import BLOCK_CELLS, CELL_US, Block
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us, is_short
-from hesim_render.sources.render.change_driven.estimates import Band, Flux
+from hesim_render.sources.render.change_driven.estimates import Flux
+from hesim_render.sources.render.change_driven.kept_pilots import Ended
 from hesim_render.sources.render.change_driven.one_window import render_one_window
 from hesim_render.sources.render.change_driven.plan import Plan
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -75,6 +76,10 @@ class Blocks:
             Anchor(renderer, band, span_us, block_us, known.at(band.place), pilot)
             for band, pilot in zip_longest(self._bands, pilots)
         ]
+        #: What the pilot of each band saw in the last window of the block before, where it is kept, as a next block may
+        #: come.
+        self._ended: list[Ended | None] = [None] * len(self._bands)
+        self._keeps = False
         #: Window whose flux is `_last`.
         self._time: tuple[float, float] | None = None
         self._last = known
@@ -99,17 +104,18 @@ class Blocks:
             return out
         if following is not None and is_between(block, following):
             # it is interpolated like any other window in which nothing bends
-            self._next = self._taken(following)
+            self._next = self._taken(following, is_last=False)
             return self._next.between(0.5 * float(block.begin_us[0] + block.end_us[0]))
-        return self._taken(block)
+        return self._taken(block, following is None)
 
-    def _taken(self, block: Block) -> "BlockFlux":
+    def _taken(self, block: Block, is_last: bool) -> "BlockFlux":
         """See `take`."""
         windows = Windows(block.begin_us, block.end_us)
         # the block begins with the window that ended the one before, whose flux is known
         is_next = self._time == (block.begin_us[0], block.end_us[0])
         # Dr.Jit keeps memory for arrays of sizes that it had; those of rays, of frames and of pixels are all others
         dr.flush_malloc_cache()
+        self._keeps = self._renderer.kept_rays > 0 and not is_last
         parts = [(band.place, self._knots(number, block, windows, is_next)) for number, band in enumerate(self._bands)]
         dr.flush_malloc_cache()
         out = BlockFlux(self._last.half_a.shape[1], parts)
@@ -139,7 +145,7 @@ class Blocks:
             if not is_short(renderer, length_us):
                 length_us = max(length_us, _LONGEST_US)
             ending = self._anchors[number] = Anchor(renderer, band, end_us, (end_us[0], end_us[1] + length_us))
-        what = self._plan(band, block, windows, anchor, ending)
+        what = self._plan(number, block, windows, anchor, ending)
         numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.place.size))
         if first is None and anchor.span_us == (block.begin_us[0], block.end_us[0]):
             first = anchor.flux_of(np.arange(band.place.size))
@@ -170,13 +176,14 @@ class Blocks:
         known[held.window, held.pixel] = True
         return Knots.of(flux, known, centre)
 
-    def _plan(self, band: Band, block: Block, windows: Windows, anchor: Anchor, ending: Anchor) -> Plan:
+    def _plan(self, number: int, block: Block, windows: Windows, anchor: Anchor, ending: Anchor) -> Plan:
         """Plan of a band in a block; what lies behind the last wanted window, at the end of a run, is not rendered."""
-        renderer = self._renderer
+        renderer, band = self._renderer, self._bands[number]
         numbers = np.broadcast_to(np.arange(windows.size)[:, None], (windows.size, band.sites.size))
-        pilot, _ = renderer.pilot(
-            band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride, ending=ending.pilot
-        )
+        begun, self._ended[number] = self._ended[number], None
+        given = band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride
+        pilot, _ = renderer.pilot(*given, ending=ending.pilot, begun=begun, is_kept=self._keeps)
+        self._ended[number] = pilot.ended
         shares = None
         if anchor.shares is not None and ending.shares is not None:
             shares = anchor.shares, ending.shares

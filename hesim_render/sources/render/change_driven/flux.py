@@ -214,6 +214,11 @@ class ChangeDrivenFlux:
         return self._renderer.has_ticks
 
     @property
+    def kept_rays(self) -> int:
+        """See `AdaptiveRenderer.kept_rays`."""
+        return self._renderer.kept_rays
+
+    @property
     def sees_paths(self) -> bool:
         """True if not all visible light is direct light on diffuse surfaces."""
         return not self._tracer.is_diffuse

@@ -24,6 +24,8 @@ _SINGLE = 4096
 #: pilot rays) and per frame pixel, where there are frames, bytes: fitted to the star on `davis346` and `eiger`, the
 #: sweep on `gen2` and `imx636`; judged on `fan` on `dvxplorer`.
 _BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 75, 500, 60
+#: Of a pilot ray that is kept: its two fluxes, and its part of the statistics of its pixel.
+_KEPT_BYTES = 10
 #: Time of plans, statistics and copies for each ray, beside that of tracing it, s: of event pixels (`rotating-star` on
 #: `davis346` and `eiger`, `camera-sweep` on `gen2`, 0.02 s each), and of frames (`camera-sweep` and `pendulum` on
 #: `reference-bayer`, 0.04 s each), on two threads of AVX-512 servers.
@@ -99,7 +101,7 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         traces += frame.traces * float(np.ceil(pixel.size / pixels_at_once("any", source.has_ticks, False))) * times
     speed, rays = look.speed(), picture + pilots
     path_audit = _PATH_AUDIT_RAYS * min(1.0, demand.duration_us / _PATH_AUDIT_US)
-    held = _EVENT_BYTES * event_pixel.size
+    held = (_EVENT_BYTES + _KEPT_BYTES * source.kept_rays) * event_pixel.size
     return Estimate(
         seconds=picture * speed.picture_ray_s + pilots * speed.pilot_ray_s + beside_s + traces * speed.start_s,
         peak_bytes=_BASE_BYTES

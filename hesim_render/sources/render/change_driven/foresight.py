@@ -102,6 +102,9 @@ class Foresight:
             against = () if anchor is None else (anchor.pilot, renderer.look_stride)
             pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, *against)
             rays[3] += share * (renderer.counts.pilot_rays - before)
+            if anchor is not None and not anchor.pilot.is_in(windows, numbers[0]):
+                # the first window is known from the block before
+                rays[3] -= band.place.size * renderer.kept_rays
             # the same plan as in a run, of which the rays are counted and not traced
             before, fit = self._tracer.rays_done, None
             block = windows if role == "events" and windows.size > 1 else None

@@ -48,9 +48,15 @@ class Looks:
             for name, values in self.tables.items():
                 values[window, place] = getattr(seen, name)
 
-    def at_end(self) -> PilotFlux:
-        """Look at all sites in the last window, which is the first of the next block; what they show there."""
-        self._in_all([self._last])
+    def at_end(self, seen: PilotFlux | None = None) -> PilotFlux:
+        """Look at all sites in the last window, which is the first of the next block, unless it is known what they show
+        there; what they show.
+        """
+        if seen is None:
+            self._in_all([self._last])
+        else:
+            for name, values in self.tables.items():
+                values[self._last] = getattr(seen, name)
         return PilotFlux(met=self._near, **{name: values[self._last] for name, values in self.tables.items()})
 
     def compare_end(self, place: NDArray[np.int64]) -> None:

@@ -7,8 +7,8 @@ from hesim_render.core.distinct import distinct_columns
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.error_target import Role
 from hesim_render.sources.render.change_driven.estimates import Band, Flux
+from hesim_render.sources.render.change_driven.kept_pilots import Anchored
 from hesim_render.sources.render.change_driven.neighbours import REACH, RowWindows, turns
-from hesim_render.sources.render.change_driven.pilot import Anchored
 from hesim_render.sources.render.change_driven.windows import Windows
 
 #: Part of the pixels that may be constant and yet be traced in each block, so that the pilot of all goes on.

@@ -20,6 +20,7 @@ from hesim_render.sources.render.change_driven.change_detector import (
     windows_with_changes,
 )
 from hesim_render.sources.render.change_driven.deep_shadow import DeepShadow
+from hesim_render.sources.render.change_driven.kept_pilots import Anchored, Ended
 from hesim_render.sources.render.change_driven.known_shadows import with_known_shadows
 from hesim_render.sources.render.change_driven.looks import Looks
 from hesim_render.sources.render.change_driven.neighbours import Sites
@@ -51,32 +52,6 @@ class Refinement:
     rays: NDArray[np.int64]
     controlled_scatter: NDArray[np.float32]
     plain_scatter: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Anchored:
-    """Pilot of all sites in the anchor of their block, see `anchor`.
-
-    Parameters
-    ----------
-    flux : its statistics, [site].
-    rays : its rays.
-    window_us : begin and end of the anchor, µs.
-    near_us : interval for which `flux.met` holds, or a longer one, µs; None: that of the anchor.
-    is_long : True if this interval holds many blocks, so that each has to ask what comes near within its own.
-    """
-
-    flux: PilotFlux
-    rays: PilotRays
-    window_us: tuple[float, float]
-    near_us: tuple[float, float] | None = None
-    is_long: bool = False
-
-    def tells(self, span_us: tuple[float, float] | None) -> bool:
-        """True if `flux.met` is True wherever a ray came near a moving object within an interval, µs."""
-        if span_us is None or self.near_us is None:
-            return False
-        return self.near_us[0] <= span_us[0] and span_us[1] <= self.near_us[1]
 
 
 @dataclass(frozen=True)
@@ -113,6 +88,7 @@ class Pilot:
     deep : sites in deep shadow; None if there are none.
     shadows : [window, site], known shadows, see `PairTracer.trace`; None if there are none.
     bounced_scatter : scatter of what paths find beside closed forms, e⁻/s; None if there is nothing.
+    ended : what the next block begins with; None where it has to look again.
     """
 
     controlled: NDArray[np.float32]
@@ -127,6 +103,7 @@ class Pilot:
     deep: DeepShadow | None = None
     shadows: NDArray[np.uint32] | None = None
     bounced_scatter: NDArray[np.float32] | None = None
+    ended: Ended | None = None
 
     @property
     def windows(self) -> int:
@@ -147,6 +124,13 @@ class Pilot:
         return np.where(chosen, self.controlled, self.plain)
 
 
+def knows_rest(tracer: PairTracer) -> bool:
+    """True if what no ray sees come near is at rest: not with a moving camera, or a lens that spreads light of what
+    moves.
+    """
+    return tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
+
+
 def take_pilot(
     tracer: PairTracer,
     sites: Sites,
@@ -163,6 +147,8 @@ def take_pilot(
     mild: bool = False,
     few_stride: int = 1,
     ending: Anchored | None = None,
+    begun: Ended | None = None,
+    is_kept: bool = False,
 ) -> tuple[Pilot, NDArray[np.bool_]]:
     """Trace the pilot pass.
 
@@ -181,6 +167,9 @@ def take_pilot(
     mild : take the mild scatter, see `PilotFlux`.
     few_stride : number of windows from one look of few rays to the next, see `windows_with_changes`.
     ending : pilot of the anchor with which the last window is compared; None: that of the first window.
+    begun : what the block before ended with, see `Ended`; taken if this one begins with the same window.
+    is_kept : keep what the last window shows for the next block, if the camera moves. Where it rests, rays have to tell
+        what comes near in the next block.
 
     Returns
     -------
@@ -190,34 +179,17 @@ def take_pilot(
     """
     count, every, given = numbers.shape[0], np.arange(sites.size), (windows, rays, width_px)
     ending = anchored if ending is None else ending
-    # what no ray sees come near in the whole span is at rest; with a moving camera, or a lens that spreads light, rays
-    # cannot tell
-    knows = tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
-    # rays of the first window that others are compared with, and where those of each site stand among them
-    own_rays: PilotRays | None = None
-    own_place, own_count = every, sites.size
-    if known is not None:
-        first = known
-    elif anchored is None:
-        first = tracer.pilot(sites.index, numbers[0], *given, span_us=span_us, mild=mild)
-    elif anchored.tells(span_us) and not anchored.is_long and _is_window(anchored.window_us, windows, numbers[0]):
-        # the first window is the anchor itself, whose rays are known
-        first, own_rays = anchored.flux, anchored.rays
-    else:
-        some, first = every, anchored.flux
-        if anchored.is_long and anchored.tells(span_us) and knows:
-            # what nothing comes near for much longer shows here what it does in the anchor; one site at least is
-            # traced, as kernels need a ray
-            some = np.flatnonzero(first.met) if first.met.any() else every[:1]
-        own_place, own_count = np.zeros(sites.size, np.int64), some.size
-        own_place[some] = np.arange(some.size)
-        listed, against = sites.index[some], (anchored.rays, some)
-        which = listed, numbers[0, some], windows, rays, width_px
-        seen, own_rays = tracer.pilot_rays(*which, span_us=span_us, before=against, mild=mild)
-        first = first.with_pairs(some, seen)
+    knows = knows_rest(tracer)
     # known shadows [window, site]: shapes that hide light in the first window do so in those that follow
     shadows, given_shadows = np.zeros((count, sites.size), np.uint32), (rays, width_px, wanted, mild)
-    first, shadows[:] = with_known_shadows(tracer, (sites.index, numbers[0], windows), first, *given_shadows)
+    if begun is not None and not knows and begun.begins(windows, numbers[0], anchored):
+        own_rays: PilotRays | None = begun.rays
+        first, own_place, own_count = begun.flux, every, sites.size
+        shadows[:] = begun.shadows
+    else:
+        one = tracer, sites, windows, numbers[0], rays, width_px, span_us, anchored, known, mild, knows
+        first, own_rays, own_place, own_count = _in_first(*one)
+        first, shadows[:] = with_known_shadows(tracer, (sites.index, numbers[0], windows), first, *given_shadows)
     near = first.met if knows else np.ones(sites.size, np.bool_)
 
     def look(window: NDArray[np.int64], place: NDArray[np.int64]) -> PilotFlux:
@@ -234,14 +206,19 @@ def take_pilot(
             shadows=shadows[window, place],
         )
 
-    looks = Looks(first, count, near, look)
+    looks, ended = Looks(first, count, near, look), None
     if count > 1 and near.any():
         # the last window is the first of the next block, whose shadows are its own
         shadows[-1, near] = 0
         pairs = sites.index, numbers[-1], windows
-        at_end, own = with_known_shadows(tracer, pairs, looks.at_end(), *given_shadows, among=near)
+        seen, end_rays = None, None
+        if is_kept and ending is not None and not knows:
+            seen, end_rays = tracer.pilot_rays(*pairs, rays, width_px, before=(ending.rays, every), mild=mild)
+        at_end, own = with_known_shadows(tracer, pairs, looks.at_end(seen), *given_shadows, among=near)
         shadows[-1, near] = own[near]
         looks.put(count - 1, at_end)
+        if end_rays is not None and ending is not None:
+            ended = Ended.of(at_end, end_rays, own, windows, numbers[-1], ending)
         if stride == 1 and rays > DETECTOR_RAYS and wanted is not None and count > 2:
             # few rays tell which windows show anything new
             of = tracer, sites, numbers, windows, first, near, wanted, width_px, mild
@@ -267,13 +244,56 @@ def take_pilot(
     aims = Aims.of([(window, *one.aims) for window, one in near_by if one.aims is not None], sites.size)
     refined = _refine(tracer, sites, windows, numbers, pilot, width_px, near_by, aims, shadows)
     moves = tracer.camera is not None
-    return replace(pilot, refined=refined, aims=aims, change=change, all_move=moves, shadows=shadows), near
+    return replace(pilot, refined=refined, aims=aims, change=change, all_move=moves, shadows=shadows, ended=ended), near
 
 
-def _is_window(span_us: tuple[float, float], windows: Windows, numbers: NDArray[np.int64]) -> bool:
-    """True if all sites have one window, which is this one."""
-    one = numbers[0]
-    return bool(np.all(numbers == one)) and span_us == (float(windows.begin_us[one]), float(windows.end_us[one]))
+def _in_first(
+    tracer: PairTracer,
+    sites: Sites,
+    windows: Windows,
+    numbers: NDArray[np.int64],
+    rays: int,
+    width_px: float,
+    span_us: tuple[float, float] | None,
+    anchored: Anchored | None,
+    known: PilotFlux | None,
+    mild: bool,
+    knows: bool,
+) -> tuple[PilotFlux, PilotRays | None, NDArray[np.int64], int]:
+    """What sites show in the first window, and the rays that others are compared with: None where nothing is compared.
+
+    Parameters
+    ----------
+    tracer, sites, windows, rays, width_px, span_us, anchored, known, mild : see `take_pilot`.
+    numbers : [site], window number of each site.
+    knows : rays can tell what is at rest.
+
+    Returns
+    -------
+    first : statistics of the window.
+    own_rays : its rays.
+    own_place : [site], where those of each site stand among them.
+    own_count : number of sites that were traced.
+    """
+    every = np.arange(sites.size)
+    if known is not None:
+        return known, None, every, sites.size
+    if anchored is None:
+        given = windows, rays, width_px
+        return tracer.pilot(sites.index, numbers, *given, span_us=span_us, mild=mild), None, every, sites.size
+    if anchored.tells(span_us) and not anchored.is_long and anchored.is_in(windows, numbers):
+        # the first window is the anchor itself, whose rays are known
+        return anchored.flux, anchored.rays, every, sites.size
+    some = every
+    if anchored.is_long and anchored.tells(span_us) and knows:
+        # what nothing comes near for much longer shows here what it does in the anchor; one site at least is traced, as
+        # kernels need a ray
+        some = np.flatnonzero(anchored.flux.met) if anchored.flux.met.any() else every[:1]
+    own_place = np.zeros(sites.size, np.int64)
+    own_place[some] = np.arange(some.size)
+    which = sites.index[some], numbers[some], windows, rays, width_px
+    seen, own_rays = tracer.pilot_rays(*which, span_us=span_us, before=(anchored.rays, some), mild=mild)
+    return anchored.flux.with_pairs(some, seen), own_rays, own_place, some.size
 
 
 def _refine(
