@@ -147,8 +147,8 @@ def test_what_is_left_out_and_what_is_not():
 
 
 def test_a_plan_knows_the_end_of_the_run(monkeypatch):
-    """Thirty windows between which the flux goes up and down by 70, of which the run asks for the first four: two looks
-    behind these tell that the fourth is needed.
+    """Thirty windows between which the flux goes up and down by 70, of which the run asks for the first four: a look
+    behind these tells that the fourth is needed.
     """
     count, flux = 30, np.tile([[530.0], [460.0]], (15, 2)).astype(np.float32)
     ends = 70.0 * np.arange(2, count + 2)
@@ -160,7 +160,7 @@ def test_a_plan_knows_the_end_of_the_run(monkeypatch):
     )
     band = SimpleNamespace(sites=None, unit=None, quality=0.5, index=np.array([7, 8], np.uint32))
     short = adaptive.AdaptiveRenderer.plan(own, None, band, True, windows, until=3)
-    assert max(window for window, _ in tracer.asked) == 3 + 4
+    assert max(window for window, _ in tracer.asked) == 3 + 1
     assert np.flatnonzero(short.rendered[:, 1]).tolist() == [0, 1, 2, 3]
     whole = adaptive.AdaptiveRenderer.plan(own, None, band, True, windows)
     assert max(window for window, _ in tracer.asked) == count - 1 and whole.rendered.all()

@@ -20,8 +20,6 @@ from hesim_render.sources.render.change_driven.windows import Windows
 
 #: Repetition of these rays in the stream of decision rays, of which lines have 0 to 2.
 _REPEAT = 3
-#: Looks of a pixel that are traced at a time, once those up to the end of the run are known.
-_AHEAD = 4
 
 
 def straightened(
@@ -114,13 +112,13 @@ def polyline(
     # slopes of the lines from there that pass all windows between
     least, largest = np.full(pixels, -np.inf), np.full(pixels, np.inf)
     needed, active = known.copy(), np.arange(pixels)
-    # the first looks: all up to the end, and a few behind it
-    at_first = np.count_nonzero(known[: until + 1], axis=0) + _AHEAD
+    # the first looks: all up to the end, and one behind it; the others one by one
+    at_first = np.count_nonzero(known[: until + 1], axis=0) + 1
     while active.size:
         # more looks, where the next window has none yet
         short = active[trying[active] >= taken[active]]
         if short.size:
-            upto = np.minimum(np.maximum(at_first[short], taken[short] + _AHEAD), count[short])
+            upto = np.minimum(np.maximum(at_first[short], taken[short] + 1), count[short])
             row, col = np.nonzero((number >= taken[short]) & (number < upto))
             flux[row, short[col]] = look(window[row, short[col]], short[col])
             taken[short] = upto
