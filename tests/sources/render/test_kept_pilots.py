@@ -24,18 +24,32 @@ def run(name, sensor, end_us):
 
 
 @pytest.mark.parametrize(
-    ("sensor", "region", "end_us", "begins"),
+    ("scene", "sensor", "region", "end_us", "begins"),
     [
         # lone pixels and known shadows; six blocks, of which the fifth one has an anchor of its own
-        pytest.param("gen2", (84, 60), 102_500, 4, id="ticks"),
-        pytest.param("imx636", (13, 9, 100, 80), 2_700, 4, id="asynchronous"),
+        pytest.param("camera-sweep", "gen2", (84, 60), 102_500, 4, id="ticks"),
+        pytest.param("camera-sweep", "imx636", (13, 9, 100, 80), 2_700, 4, id="asynchronous"),
+        # the camera rests, but rays that a lens spreads cannot tell what rests
+        pytest.param("rotating-star", "gen2", (36, 28), 62_500, 2, id="spread"),
     ],
 )
-def test_values_are_the_same_and_a_block_begins_with_rays_that_are_known(monkeypatch, sensor, region, end_us, begins):
-    sensor = hr.load_sensor(sensor).crop(*region)
-    values, rays, source = run("camera-sweep", sensor, end_us)
+def test_values_are_the_same_and_a_block_begins_with_rays_that_are_known(
+    monkeypatch, scene, sensor, region, end_us, begins
+):
+    # of a measured point-spread function, each ray may come from far beyond its pixel
+    x_um = 0.7 * np.arange(-9, 10)
+    kernel = np.exp(-0.5 * (x_um[:, None] ** 2 + x_um**2) / 2.3**2)
+    psf = {
+        "type": "measured",
+        "kernels": [(kernel / kernel.sum()).tolist()],
+        "sample_um": 0.7,
+        "image_height_mm": [0.0],
+    }
+    changes = {"lens.psf": psf} if scene == "rotating-star" else {}
+    sensor = hr.load_sensor(sensor, changes).crop(*region)
+    values, rays, source = run(scene, sensor, end_us)
     monkeypatch.setattr(adaptive, "_MOST_KEPT_RAYS", 0)
-    again, all_rays, _ = run("camera-sweep", sensor, end_us)
+    again, all_rays, _ = run(scene, sensor, end_us)
     assert np.any(np.ptp(again[:, 0], axis=0) > 0)
     np.testing.assert_array_equal(values, again)
     # at least the pixels themselves; beside them are neighbours, and rays that look for shadows

@@ -168,8 +168,8 @@ def take_pilot(
     few_stride : number of windows from one look of few rays to the next, see `windows_with_changes`.
     ending : pilot of the anchor with which the last window is compared; None: that of the first window.
     begun : what the block before ended with, see `Ended`; taken if this one begins with the same window.
-    is_kept : keep what the last window shows for the next block, if the camera moves. Where it rests, rays have to tell
-        what comes near in the next block.
+    is_kept : keep what the last window shows for the next block, unless rays have to tell what comes near there, see
+        `knows_rest`.
 
     Returns
     -------
