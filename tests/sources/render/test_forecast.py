@@ -84,6 +84,8 @@ def test_the_first_pilot_goes_on_where_nearly_all_pixels_may_change(constant, sa
     assert estimate.ray_s == pytest.approx(3.033e-6) and estimate.trace_s == 0.04
     source.kept_rays = 32
     assert forecast.forecast(source, demand).peak_bytes == estimate.peak_bytes + 800 * 32 * 10
+    one = replace(demand, blocks=BlockSample(blocks[:1], 1.0))
+    assert forecast.forecast(source, one).peak_bytes == estimate.peak_bytes
     many = replace(demand, event_pixel=np.arange(3 << 17, dtype=np.uint32))
     assert forecast.forecast(source, many).seconds > 0.04 * 7 * len(blocks) * 2 + 3e-6 * 64 * (3 << 17)
 

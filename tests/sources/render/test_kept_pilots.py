@@ -57,6 +57,20 @@ def test_values_are_the_same_and_a_block_begins_with_rays_that_are_known(
     assert all_rays - rays >= begins * source.kept_rays * pixels > 0
 
 
+def test_the_last_block_of_a_run_keeps_nothing(monkeypatch):
+    pilot, keeps = adaptive.AdaptiveRenderer.pilot, []
+
+    def watched(*given, **named):
+        result = pilot(*given, **named)
+        if "is_kept" in named:
+            keeps.append((named["is_kept"], result[0].ended is not None))
+        return result
+
+    monkeypatch.setattr(adaptive.AdaptiveRenderer, "pilot", watched)
+    run("camera-sweep", hr.load_sensor("gen2").crop(36, 28), 52_500)
+    assert keeps == [(True, True), (True, True), (False, False)]
+
+
 def test_nothing_is_kept_where_the_camera_rests_or_of_too_many_pixels(monkeypatch):
     sensor = hr.load_sensor("gen2").crop(84, 60)
     star = ChangeDrivenFlux(hr.load_scene("rotating-star"), sensor)

@@ -99,7 +99,7 @@ class AdaptiveRenderer:
     def still(self, role: Role) -> Still:
         """The pixels of a role that are known to be constant, and their flux."""
         if role not in self._kept:
-            may_rest = bool(self.tracer.parts.groups) and self.tracer.camera is None and not self.tracer.rays.spreads
+            may_rest = bool(self.tracer.parts.groups) and knows_rest(self.tracer)
             self._kept[role] = Still(_ALWAYS_US if may_rest else None, self.index.size)
         return self._kept[role]
 

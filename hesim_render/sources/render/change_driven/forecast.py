@@ -101,7 +101,9 @@ def forecast(source: "ChangeDrivenFlux", demand: Demand) -> Estimate:
         traces += frame.traces * float(np.ceil(pixel.size / pixels_at_once("any", source.has_ticks, False))) * times
     speed, rays = look.speed(), picture + pilots
     path_audit = _PATH_AUDIT_RAYS * min(1.0, demand.duration_us / _PATH_AUDIT_US)
-    held = (_EVENT_BYTES + _KEPT_BYTES * source.kept_rays) * event_pixel.size
+    # pilots are kept where another block comes
+    kept = _KEPT_BYTES * source.kept_rays if demand.blocks.count > 1 else 0
+    held = (_EVENT_BYTES + kept) * event_pixel.size
     return Estimate(
         seconds=picture * speed.picture_ray_s + pilots * speed.pilot_ray_s + beside_s + traces * speed.start_s,
         peak_bytes=_BASE_BYTES
